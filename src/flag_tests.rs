@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 44] = [
+const PRINTED_BY: [(&str, &[&str]); 45] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -48,6 +48,7 @@ const PRINTED_BY: [(&str, &[&str]); 44] = [
     ("calibration/src/hand_eye", &["calibrate hand-eye"]),
     ("capture/src/init", &["init"]),
     ("capture/src/open/steered.rs", &["run"]),
+    ("capture/src/open/steered_base.rs", &["run"]),
     ("capture/src/record.rs", &["record"]),
     ("capture/src/requested_motion.rs", &["move"]),
     ("capture/src/rig_facts", &["doctor"]),

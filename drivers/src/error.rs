@@ -151,6 +151,12 @@ pub enum Error {
         /// Description of the problem.
         reason: String,
     },
+    /// A base cannot be driven.
+    #[error("the base cannot be driven: {reason}")]
+    BaseMotion {
+        /// Description of the problem.
+        reason: String,
+    },
     /// A serial port cannot be opened, or was disconnected.
     #[error("serial port {device:?}: {reason}")]
     SerialPort {

@@ -13,6 +13,7 @@
 //! ```
 
 pub mod align;
+pub mod base_motion;
 pub mod can;
 pub mod clock;
 mod datagrams;
@@ -54,6 +55,7 @@ pub mod v4l2;
 pub mod wire;
 mod yuv;
 
+pub use base_motion::MovableBase;
 pub use error::{Error, RecordedSpan};
 pub use flange_difference::FlangeDifference;
 pub use live_devices::{Devices, LiveDevices};

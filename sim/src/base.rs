@@ -30,6 +30,8 @@ pub(crate) enum BaseMotion {
 
 /// Duration of a lap at speed 1, seconds.
 const LAP_SECS: f64 = 36.0;
+/// Length of a lap, meters: a circle with the mean radius of the lap.
+pub(crate) const LAP_M: f64 = TAU * 2.25;
 /// Gait frequency at speed 1. A trotting quadruped of this size takes one to two steps per second.
 const GAIT_HZ: f64 = 1.7;
 /// Amplitudes of the body motion that the gait causes. A quadruped of this size moves its body by
@@ -73,6 +75,16 @@ impl BaseMotion {
             Scene::StaticArm => Self::Fixed,
             Scene::MobileBase => Self::Lap(speed),
             Scene::MobileArm => Self::Stations(speed),
+        }
+    }
+
+    /// Height of the base link above the floor while the base stands still, meters.
+    pub(crate) fn rest_z_m(&self) -> f64 {
+        match self {
+            Self::Fixed => 0.0,
+            Self::FixedAt(world_from_base) => world_from_base.translation.z,
+            Self::Lap(_) | Self::Stations(_) => BODY_Z_M,
+            Self::Rolling { height_m, .. } => *height_m,
         }
     }
 

@@ -16,6 +16,7 @@ use crate::optics::{Optics, RowMotion};
 use crate::random::RandomStream;
 use crate::render::{Pending, Renderer};
 use crate::robot::{Robot, RobotPose};
+use crate::steered_base::BaseWay;
 use crate::{Error, render};
 use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, TruthImage};
 use kinematics::{JointState, Stamp, Transform};
@@ -44,7 +45,7 @@ pub(crate) struct Engine {
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
-    /// Counts contacts while commands move the arm, if there is a counter.
+    /// Counts contacts while commands move the arm or the base, if there is a counter.
     contacts: Option<ContactCounter>,
     /// Whether the robot moves ahead of its samples while images are rendered.
     looks_ahead: bool,
@@ -376,7 +377,15 @@ impl Engine {
         Ok(())
     }
 
-    /// Counts contacts while commands move the arm, if there is a counter.
+    /// Lets an operator take the base over from its tour. Returns the way of
+    /// the base. `start` is simulated time zero on the clock of the thread that drives it.
+    pub(crate) fn steer_base(&mut self, start: Stamp) -> BaseWay {
+        let way = BaseWay::new(start, *self.robot.motion());
+        self.robot.steer_base(way.clone());
+        way
+    }
+
+    /// Counts contacts while commands move the arm or the base, if there is a counter.
     pub(crate) fn count_contacts(&mut self, contacts: Option<ContactCounter>) {
         self.contacts = contacts;
     }
@@ -532,11 +541,8 @@ impl Engine {
     /// Emits the base pose as reported by its SLAM system, and the ground truth.
     fn emit_base_pose(&mut self, nanos: i64) {
         let stamp = Stamp(self.start.0 + nanos);
-        let secs = nanos as f64 * 1e-9;
-        let truth = self.robot.motion().world_from_base(secs);
-        let reported = self
-            .drift
-            .reported(&truth, self.robot.motion().walked_frac(secs));
+        let truth = self.robot.world_from_base(nanos);
+        let reported = self.drift.reported(&truth, self.robot.walked_frac(nanos));
         self.ready.push_back((
             nanos,
             Sample::Base(BasePose {
@@ -567,10 +573,9 @@ impl Engine {
         else {
             return Ok(());
         };
-        let motion = self.robot.motion();
+        let robot = &self.robot;
         let random = RandomStream::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
-        let world_from_base =
-            |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
+        let world_from_base = |offset_nanos: i64| robot.world_from_base(nanos + offset_nanos);
         let points =
             lidar::scan_revolution(rays, scanner, self.config.ideal, random, world_from_base)?;
         let stamp = Stamp(self.start.0 + nanos);

@@ -55,6 +55,7 @@ mod robot_masks;
 mod scan;
 mod scene;
 mod steered_arm;
+mod steered_base;
 pub mod tag;
 mod texture;
 mod toy;
@@ -76,11 +77,12 @@ pub use config::{
     SensorConfig, StampConfig, TargetConfig, TargetParent,
 };
 pub use error::Error;
-pub use live_rig::{LiveRig, LiveTruth};
+pub use live_rig::{LiveRig, LiveTruth, SteeredBaseRig};
 pub use lockstep::Lockstep;
 pub use motors::MotorHistory;
 pub use rig::{PANDA_URDF, Rig, difference_to_robot_of, has_robot_of, open, suits_own_robot};
 pub use rig_info::{CameraInfo, RigInfo};
 pub use robot_masks::{PinholeView, RobotMasks};
 pub use steered_arm::{SteeredArm, SteeredLimits};
+pub use steered_base::SteeredBase;
 pub use twin::RobotConfig;

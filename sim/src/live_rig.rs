@@ -6,6 +6,8 @@ use crate::engine::{Delivery, Engine};
 use crate::handover::Handover;
 use crate::rig_info::RigInfo;
 use crate::steered_arm::{Controller, SteeredArm, SteeredLimits};
+use crate::steered_base::SteeredBase;
+use drivers::base_motion::MovableBase;
 use drivers::{
     Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample,
 };
@@ -42,6 +44,18 @@ pub struct LiveRig {
     pub truth: LiveTruth,
     /// True parameters of the rig.
     pub info: RigInfo,
+}
+
+/// Simulated devices in real time, with a base that an operator may drive.
+pub struct SteeredBaseRig {
+    /// The devices.
+    pub live: LiveRig,
+    /// The base, for the program.
+    pub base: SteeredBase,
+    /// The base, for the thread that drives it.
+    pub driven: Box<dyn MovableBase>,
+    /// Simulated time zero on the clock of this computer.
+    pub start: Stamp,
 }
 
 /// Ground truth of the live devices.
@@ -144,6 +158,24 @@ impl LiveRig {
             Controller::start(limits, &position, handover, started, n_contacts)?;
         let rig = Self::start_with(engine, info, start, started, Some(controller))?;
         Ok((rig, arm))
+    }
+
+    /// Starts a rig whose base an operator may take over from its tour.
+    pub(crate) fn start_with_steered_base(
+        (mut engine, contacts): (Engine, Option<ContactCounter>),
+        info: RigInfo,
+    ) -> Result<SteeredBaseRig, Error> {
+        let start = drivers::clock::now();
+        let started = Instant::now();
+        let way = engine.steer_base(start);
+        let n_contacts = contacts.as_ref().map(ContactCounter::n_contacts);
+        engine.count_contacts(contacts);
+        Ok(SteeredBaseRig {
+            driven: way.driven(),
+            live: Self::start_with(engine, info, start, started, None)?,
+            base: SteeredBase::new(way, n_contacts),
+            start,
+        })
     }
 
     fn start_with(

@@ -8,7 +8,7 @@ use crate::config::{Config, N_JOINTS, Parent, Scene};
 use crate::contacts::ContactCounter;
 use crate::engine::{Cameras, Engine, history_nanos};
 use crate::follower::{Follower, Tour};
-use crate::live_rig::LiveRig;
+use crate::live_rig::{LiveRig, SteeredBaseRig};
 use crate::lockstep::Lockstep;
 use crate::motors::MotorHistory;
 use crate::objects::{TABLE_Z_M, TARGET_XY_M};
@@ -282,6 +282,14 @@ fn camera_info(camera: &CameraConfig, ideal: bool) -> CameraInfo {
     }
 }
 
+/// The counter of contacts. Steering does not need it: contacts only measure how well it works.
+fn contact_counter(build: BuildContacts) -> Option<ContactCounter> {
+    build()
+        .map(ContactCounter::new)
+        .inspect_err(|error| log::warn!("contacts with the scene are not counted: {error}"))
+        .ok()
+}
+
 impl Rig {
     /// True parameters of the rig.
     pub fn info(&self) -> &RigInfo {
@@ -331,12 +339,18 @@ impl Rig {
         start: Stamp,
         limits: SteeredLimits<'_>,
     ) -> Result<(LiveRig, SteeredArm), Error> {
-        // Steering does not need the contacts, which only measure how well it works.
-        let contacts = (self.build_contacts)()
-            .map(ContactCounter::new)
-            .inspect_err(|error| log::warn!("contacts with the scene are not counted: {error}"))
-            .ok();
+        let contacts = contact_counter(self.build_contacts);
         LiveRig::start_steered((self.engine, contacts), self.info, start, limits)
+    }
+
+    /// Lets the rig run in real time, with a base that an operator may take over from its tour.
+    ///
+    /// # Errors
+    ///
+    /// If a thread cannot be started.
+    pub fn into_steered_base(self) -> Result<SteeredBaseRig, Error> {
+        let contacts = contact_counter(self.build_contacts);
+        LiveRig::start_with_steered_base((self.engine, contacts), self.info)
     }
 
     /// Lets the rig run in real time. Simulated time zero is the time of this call, which is

@@ -2,10 +2,11 @@
 
 use crate::Error;
 use crate::arm::{Arm, JointReading, STEP_NANOS};
-use crate::base::BaseMotion;
+use crate::base::{BaseMotion, LAP_M};
 use crate::joints::Joints;
 use crate::motors::MotorizedArm;
 use crate::panda;
+use crate::steered_base::BaseWay;
 use crate::twin::TwinModel;
 use kinematics::Transform;
 use std::sync::Arc;
@@ -75,6 +76,8 @@ enum ArmMotion {
 pub(crate) struct Robot {
     arm: Option<ArmMotion>,
     motion: BaseMotion,
+    /// The way of the base after its tour, if an operator may drive it.
+    way: Option<BaseWay>,
     kinematics: RobotKinematics,
     n_steps: i64,
 }
@@ -85,13 +88,35 @@ impl Robot {
         Self {
             arm,
             motion,
+            way: None,
             kinematics,
             n_steps: 0,
         }
     }
 
+    /// The tour of the base.
     pub(crate) fn motion(&self) -> &BaseMotion {
         &self.motion
+    }
+
+    /// Lets an operator take the base over from its tour.
+    pub(crate) fn steer_base(&mut self, way: BaseWay) {
+        self.way = Some(way);
+    }
+
+    /// True pose of the base at a time, nanoseconds.
+    pub(crate) fn world_from_base(&self, nanos: i64) -> Transform {
+        let steered = self.way.as_ref().and_then(|way| way.world_from_base(nanos));
+        steered.unwrap_or_else(|| self.motion.world_from_base(nanos as f64 * 1e-9))
+    }
+
+    /// Completed fraction of the walk, from which the drift of the reported pose follows.
+    pub(crate) fn walked_frac(&self, nanos: i64) -> f64 {
+        let steered = self
+            .way
+            .as_ref()
+            .and_then(|way| way.walked_frac(nanos, LAP_M));
+        steered.unwrap_or_else(|| self.motion.walked_frac(nanos as f64 * 1e-9))
     }
 
     /// The arm, if there is one that the simulation moves.
@@ -102,9 +127,10 @@ impl Robot {
         }
     }
 
-    /// Whether commands move the arm, which may come at any time.
+    /// Whether commands move the arm or the base, which may come at any time.
     pub(crate) fn is_commanded(&self) -> bool {
         matches!(&self.arm, Some(ArmMotion::Simulated(arm)) if arm.is_commanded())
+            || self.way.as_ref().is_some_and(BaseWay::has_begun)
     }
 
     /// Replaces the arm by one that emulated motors move.
@@ -118,6 +144,9 @@ impl Robot {
     pub(crate) fn step(&mut self) -> Result<(i64, Option<JointReading>), Error> {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
+        if let Some(way) = &self.way {
+            way.step(nanos);
+        }
         let reading = match &mut self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.step()),
             // The motors run on another clock, which the simulation follows.
@@ -137,7 +166,7 @@ impl Robot {
             Some(ArmMotion::Motorized(arm)) => Some(arm.position_at(nanos)?),
             None => None,
         };
-        let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);
+        let world_from_base = self.world_from_base(nanos);
         Some(self.kinematics.pose(world_from_base, position.as_ref()))
     }
 }

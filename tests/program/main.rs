@@ -47,6 +47,8 @@ mod schema;
 #[cfg(feature = "sim")]
 mod small_rig;
 #[cfg(feature = "sim")]
+mod steered_base;
+#[cfg(feature = "sim")]
 mod steering;
 #[cfg(feature = "sim")]
 mod terminal;

@@ -25,22 +25,57 @@ pub(crate) fn write(folder: &Path, pace: Pace) {
 /// Does the same as [`write`], but changes the table `[sim]` first.
 pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
-    let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
-    let mut rig: toml::Table = text.parse().expect("TOML");
-    let urdf = rig["arm"]["urdf"].as_str().expect("a robot").to_owned();
-    std::fs::create_dir_all(folder.join(&urdf).parent().expect("inside the folder"))
+    let mut rig = shipped(&rigs, "static-arm.toml");
+    copy_urdf(&rigs, folder, &rig);
+    shrink(rig["camera"]["wrist"].as_table_mut().expect("a camera"));
+    let sim = rig["sim"].as_table_mut().expect("a simulation");
+    sim.insert("ideal".into(), true.into());
+    change(sim);
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");
+}
+
+/// Writes `rig.toml` into a folder: `rigs/mobile-base-small.toml` in real time, with only its front
+/// camera at a quarter of its image size, without sensor imperfections, and the files it refers to.
+pub(crate) fn write_base(folder: &Path) {
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let mut rig = shipped(&rigs, "mobile-base-small.toml");
+    copy_urdf(&rigs, folder, &rig);
+    rig.remove("range");
+    // Corrections of the map would look like motions of the base.
+    let base = rig["base"].as_table_mut().expect("a base");
+    base.insert("realign".into(), false.into());
+    let cameras = rig["camera"].as_table_mut().expect("cameras");
+    cameras.remove("rear");
+    shrink(cameras["front"].as_table_mut().expect("a camera"));
+    let sim = rig["sim"].as_table_mut().expect("a simulation");
+    sim.insert("ideal".into(), true.into());
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");
+}
+
+fn shipped(rigs: &Path, name: &str) -> toml::Table {
+    let text = std::fs::read_to_string(rigs.join(name)).expect("a shipped rig file");
+    text.parse().expect("TOML")
+}
+
+/// Copies the robot description of a rig.
+fn copy_urdf(rigs: &Path, folder: &Path, rig: &toml::Table) {
+    let urdf = rig["arm"]["urdf"].as_str().expect("a robot");
+    std::fs::create_dir_all(folder.join(urdf).parent().expect("inside the folder"))
         .expect("the disk has space");
-    std::fs::copy(rigs.join(&urdf), folder.join(&urdf)).expect("the robot's description");
-    let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
+    std::fs::copy(rigs.join(urdf), folder.join(urdf)).expect("the robot's description");
+}
+
+/// Divides the size of the images of a camera.
+fn shrink(camera: &mut toml::Table) {
     for (table, key) in [
         ("", "size_px"),
         ("intrinsics", "focal_px"),
         ("intrinsics", "principal_px"),
     ] {
         let holder = if table.is_empty() {
-            &mut *wrist
+            &mut *camera
         } else {
-            wrist[table].as_table_mut().expect("a table")
+            camera[table].as_table_mut().expect("a table")
         };
         for number in holder[key].as_array_mut().expect("two numbers") {
             *number = match &*number {
@@ -51,8 +86,4 @@ pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
             };
         }
     }
-    let sim = rig["sim"].as_table_mut().expect("a simulation");
-    sim.insert("ideal".into(), true.into());
-    change(sim);
-    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");
 }

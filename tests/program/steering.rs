@@ -20,7 +20,7 @@ const DISTANCE_M: f64 = 0.1;
 const ARRIVED_RAD: f64 = 0.01;
 
 /// A run, which is killed if the test fails.
-struct Run {
+pub(crate) struct Run {
     child: Child,
     address: String,
     /// Kept, so that the run can print until its end.
@@ -35,7 +35,7 @@ impl Drop for Run {
 }
 
 impl Run {
-    fn start(folder: &Path, flags: &[&str]) -> Self {
+    pub(crate) fn start(folder: &Path, flags: &[&str]) -> Self {
         Self::launch(
             Command::new(env!("CARGO_BIN_EXE_fieldrig"))
                 .args([
@@ -69,7 +69,7 @@ impl Run {
     }
 
     /// Connects to a WebSocket; `None` if the server refuses.
-    fn connect(&self, path: &str) -> Option<WebSocket<TcpStream>> {
+    pub(crate) fn connect(&self, path: &str) -> Option<WebSocket<TcpStream>> {
         let stream = TcpStream::connect(&self.address).expect("the server listens");
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
         let url = format!("ws://{}{path}", self.address);
@@ -99,7 +99,7 @@ impl Run {
         self.child.wait().expect("our own child");
     }
 
-    fn interrupt(mut self) {
+    pub(crate) fn interrupt(mut self) {
         let pid = rustix::process::Pid::from_child(&self.child);
         rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("it runs");
         assert!(self.child.wait().expect("our own child").success());
@@ -216,7 +216,7 @@ impl Operator {
     }
 }
 
-fn numbers(value: &Value) -> Vec<f64> {
+pub(crate) fn numbers(value: &Value) -> Vec<f64> {
     let list = value
         .as_array()
         .unwrap_or_else(|| panic!("no list: {value}"));
@@ -323,7 +323,7 @@ fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centim
 }
 
 /// Repeats the decisions of the run.
-fn replay(folder: &Path) -> Value {
+pub(crate) fn replay(folder: &Path) -> Value {
     try_replay(folder).expect("a complete line")
 }
 

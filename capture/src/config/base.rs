@@ -1,5 +1,6 @@
 //! The keys in `[base]`, and the tags that locate a base.
 
+use super::base_motion::BaseMotion;
 use super::key::{Keys, choices, entry, keys, table_of};
 use super::section::Section;
 use super::table_schema::TableSchema;
@@ -36,6 +37,8 @@ keys! {
         pub tag_family: Family = Family::Tag36h11;
         /// Sizes and poses of the tags in the world, by ID.
         pub tags: BTreeMap<u32, TagPlacement> => BTreeMap::new();
+        /// How an operator may drive the base.
+        pub motion: Option<BaseMotion>;
         /// Errors of a simulated base.
         pub sim: BaseSim;
     }

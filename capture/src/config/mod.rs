@@ -7,6 +7,7 @@
 
 mod arm;
 mod base;
+mod base_motion;
 mod camera;
 mod camera_info_file;
 mod can;
@@ -38,6 +39,7 @@ mod urdf_folder;
 
 pub use arm::{Arm, ArmDriver};
 pub use base::{Base, BaseDriver, BaseSim};
+pub use base_motion::BaseMotion;
 pub use camera::{
     Camera, CameraDriver, CameraSim, Depth, Parent, Realsense, TimeOffset, UnknownCalibration, V4l2,
 };

@@ -37,6 +37,9 @@ pub(super) fn read(
         rig.arm.urdf_text = arm::EMPTY_URDF.to_owned();
     }
     arm::resolve_joints(file, &mut rig.arm)?;
+    if let Some(motion) = &rig.base.motion {
+        motion.check(file, rig.arm.joints.len())?;
+    }
     Ok(rig)
 }
 

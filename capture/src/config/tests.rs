@@ -63,6 +63,7 @@ counts_per_turn = 65536
 id = 1
 [arm.motion]
 on_loss = "release"
+[base.motion]
 [base.tag.7]
 size_m = 0.1
 [camera.wrist.sim.truth]
@@ -185,6 +186,17 @@ pub(super) const KEYS: &[(&str, &str, &str)] = &[
         "[0, 1, 0, 0]",
         "[0, 0, 0, 0]",
     ),
+    ("base.motion.address", "'127.0.0.1:7020'", "'localhost'"),
+    ("base.motion.max_forward_m_s", "0.5", "0"),
+    ("base.motion.max_sideways_m_s", "0.2", "-1"),
+    ("base.motion.max_yaw_rad_s", "1", "0"),
+    ("base.motion.acceleration_m_s2", "0.2", "0"),
+    ("base.motion.yaw_acceleration_rad_s2", "0.5", "0"),
+    ("base.motion.brake_m_s2", "1", "100"),
+    ("base.motion.brake_yaw_rad_s2", "2", "0"),
+    ("base.motion.area_m", "[-1, -1, 1, 1]", "[-1, 1]"),
+    ("base.motion.stowed", "[0, -1.5]", "'folded'"),
+    ("base.motion.stowed_tolerance", "0.05", "0"),
     ("base.sim.drift_m", "0.1", "-0.1"),
     ("base.sim.drift_rad", "0.05", "2"),
     ("range.lidar.driver", "'sim'", "'laser'"),

@@ -11,12 +11,14 @@ mod meshes_to_record;
 mod movable;
 mod real;
 mod realsense;
+mod robot_tap;
 mod servos;
 #[cfg(feature = "sim")]
 mod simulated;
 #[cfg(all(test, feature = "sim"))]
 mod simulated_tests;
 mod steered;
+mod steered_base;
 #[cfg(all(test, feature = "sim"))]
 mod steered_tests;
 mod tag_check;
@@ -36,6 +38,7 @@ pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
 pub(crate) use servos::servo_config;
 pub use steered::{SteeredArm, check_steerable, steered};
+pub use steered_base::{SteeredBase, check_drivable, is_base_steered, with_steered_base};
 #[cfg(target_os = "linux")]
 pub use ur::arm_config as ur_config;
 
@@ -167,15 +170,22 @@ fn open_recording(
 /// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a
 /// setting that a driver needs.
 pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
-    Ok(open_rig(rig, devices, false)?.0)
+    let (opened, ()) = open_rig_with(rig, devices, |rig, _| {
+        let (source, stamp_clock) = open_devices(rig)?;
+        Ok((source, stamp_clock, ()))
+    })?;
+    Ok(opened)
 }
 
-/// Opens the devices of a rig, and enables its arm if it is steered.
-fn open_rig(
+/// Opens the devices of a rig with a function, which also returns what operators steer.
+///
+/// * `open`: gets the rig with all settings resolved, and the driver of the arm in the rig file, which
+///   a simulation may have replaced.
+fn open_rig_with<T>(
     mut rig: Rig,
     devices: Devices,
-    is_steered: bool,
-) -> anyhow::Result<(Opened, Option<SteeredArm>)> {
+    open: impl FnOnce(&mut Rig, ArmDriver) -> anyhow::Result<(Box<dyn Source>, StampClock, T)>,
+) -> anyhow::Result<(Opened, T)> {
     let arm_driver = rig.arm.driver;
     if devices == Devices::Sim {
         use_simulated_devices(&mut rig);
@@ -191,13 +201,7 @@ fn open_rig(
         );
     }
     check_arm(&rig)?;
-    let (source, stamp_clock, steered_arm) = if is_steered {
-        let (source, stamp_clock, arm) = steered::open_devices(&mut rig, arm_driver)?;
-        (source, stamp_clock, Some(arm))
-    } else {
-        let (source, stamp_clock) = open_devices(&mut rig)?;
-        (source, stamp_clock, None)
-    };
+    let (source, stamp_clock, steered) = open(&mut rig, arm_driver)?;
     // This source wraps all devices, because tags are searched in the images of all cameras on the
     // robot.
     let source = match rig.base.driver {
@@ -210,7 +214,7 @@ fn open_rig(
         damage: Arc::default(),
         stamp_clock,
     };
-    Ok((opened, steered_arm))
+    Ok((opened, steered))
 }
 
 /// Opens the real and the simulated devices of a rig for reading.

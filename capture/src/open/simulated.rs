@@ -6,6 +6,7 @@ use crate::config::{
     ArmDriver, Camera, CameraDriver, Depth, Parent, Rig, Scanner, ScannerDriver, SimTarget,
 };
 use anyhow::bail;
+use drivers::base_motion::MovableBase;
 use drivers::motion::MotionLimits;
 use drivers::{Devices, Error, LiveDevices, Sample, Source};
 use kinematics::{Intrinsics, Stamp, Transform};
@@ -56,6 +57,16 @@ pub(super) fn steered(
     let start = drivers::clock::now();
     let (live, arm) = opened.into_steered(start, limits)?;
     Ok((Box::new(RealTime::new(rig, live, start)?), arm))
+}
+
+/// Opens a simulated rig in real time, with a base that an operator may take over from its tour.
+/// Also returns the base for the thread that drives it. Stamps are on the clock of this computer.
+pub(super) fn with_steered_base(
+    rig: &Rig,
+) -> anyhow::Result<(Box<dyn Source>, sim::SteeredBase, Box<dyn MovableBase>)> {
+    let opened = sim::open(&without_end(config_of(rig)?))?.into_steered_base()?;
+    let source = RealTime::new(rig, opened.live, opened.start)?;
+    Ok((Box::new(source), opened.base, opened.driven))
 }
 
 /// A configuration without limits. In real time, the source checks them itself: if the simulated

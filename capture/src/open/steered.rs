@@ -78,18 +78,13 @@ impl SteeredArm {
 /// For the reasons of [`super::rig`] and [`check_steerable`], or if the arm cannot be enabled.
 pub fn steered(rig: Rig, devices: Devices) -> anyhow::Result<(Opened, SteeredArm)> {
     check_steerable(&rig, devices)?;
-    let (opened, arm) = super::open_rig(rig, devices, true)?;
-    // An arm that was not opened for motion would be a bug, which must not look like a working one.
-    let Some(arm) = arm else {
-        bail!("the arm was not opened for motion: this is a bug");
-    };
-    Ok((opened, arm))
+    super::open_rig_with(rig, devices, open_devices)
 }
 
 /// Opens the devices of a rig whose settings are checked.
 ///
 /// * `arm_driver`: driver of the arm in the rig file, which a simulation has replaced.
-pub(super) fn open_devices(
+fn open_devices(
     rig: &mut Rig,
     arm_driver: ArmDriver,
 ) -> anyhow::Result<(Box<dyn Source>, StampClock, SteeredArm)> {
@@ -179,7 +174,7 @@ pub fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
             Setting::EnableMotion
         )));
     }
-    if rig.has_moving_base() || super::base_moves(rig) {
+    if rig.has_moving_base() {
         bail!(BadInput(format!(
             "{}: an arm on a moving base cannot be steered yet: use a rig file with a fixed base, or remove the flag",
             Setting::EnableMotion
@@ -314,10 +309,9 @@ mod tests {
         assert_eq!(opened, Some(refusal));
     }
 
-    #[cfg(feature = "sim")]
     #[test]
     fn arms_on_moving_bases_and_rigs_without_arms_are_not_steered() {
-        let mobile_arm = refusal("mobile-arm.toml", &[], Devices::Sim).unwrap_or_default();
+        let mobile_arm = refusal("mobile-arm.toml", &[], Devices::Real).unwrap_or_default();
         assert!(mobile_arm.contains("moving base"), "{mobile_arm}");
         let no_arm = refusal("mobile-base.toml", &[], Devices::Sim).unwrap_or_default();
         assert!(no_arm.contains("no arm"), "{no_arm}");

@@ -40,6 +40,7 @@ pub(crate) use mailbox::{Mailbox, MotionCommand};
 pub use mover::Mover;
 pub use steered::Steered;
 pub use steering_port::SteeringPort;
+pub(crate) use target::TargetOrder;
 pub use target::{ArmState, NotFollowed, Output, Target};
 #[cfg(target_os = "linux")]
 pub(crate) use thread::{MotionThread, Reply, Request, SharedWithOwner};

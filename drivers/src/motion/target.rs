@@ -99,7 +99,7 @@ pub enum NotFollowed {
 
 /// The newest target that was accepted, and the motions that have ended.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct TargetOrder {
+pub(crate) struct TargetOrder {
     /// Number of the newest motion.
     pub(super) motion: u64,
     /// Number of the newest target of this motion.
@@ -116,12 +116,16 @@ impl TargetOrder {
         if let Some(why) = position_problem(&target.position, n_joints) {
             return Err(NotFollowed::Invalid { serial, why });
         }
-        if target.motion == self.motion && serial <= self.serial {
+        self.check_numbers(target.motion, serial)
+    }
+
+    /// Checks that a target is newer than those accepted before it.
+    pub(crate) fn check_numbers(&self, motion: u64, serial: u64) -> Result<(), NotFollowed> {
+        if motion == self.motion && serial <= self.serial {
             let newest = self.serial;
             return Err(NotFollowed::OutOfOrder { serial, newest });
         }
-        if target.motion <= self.ended_motion || target.motion < self.motion {
-            let motion = target.motion;
+        if motion <= self.ended_motion || motion < self.motion {
             return Err(NotFollowed::MotionEnded { motion });
         }
         Ok(())
@@ -129,12 +133,22 @@ impl TargetOrder {
 
     /// Records an accepted target.
     pub(super) fn accept(&mut self, target: &Target) {
-        self.motion = target.motion;
-        self.serial = target.serial;
+        self.accept_numbers(target.motion, target.serial);
+    }
+
+    /// Records the numbers of an accepted target.
+    pub(crate) fn accept_numbers(&mut self, motion: u64, serial: u64) {
+        self.motion = motion;
+        self.serial = serial;
+    }
+
+    /// The greatest number of a motion that has ended; 0 if none has.
+    pub(crate) fn ended_motion(&self) -> u64 {
+        self.ended_motion
     }
 
     /// Ends all motions up to a number.
-    pub(super) fn end_motion(&mut self, motion: u64) {
+    pub(crate) fn end_motion(&mut self, motion: u64) {
         self.ended_motion = self.ended_motion.max(motion);
     }
 }

@@ -1,10 +1,12 @@
-//! Fuzz target for datagrams to an arm, a base and a range scanner.
+//! Fuzz target for datagrams of an arm, a base and a range scanner, and for those that drive a base.
 
 use super::reader::DatagramReader;
 use super::scanner::UdpScanner;
 use super::sequence::SequenceTracker;
 use crate::RangePoint;
+use crate::base_motion::BaseVelocity;
 use crate::datagrams::receiver::ReceivedDatagram;
+use crate::wire::base_drive::{decode_command, decode_reply, encode_command, encode_reply};
 use crate::wire::datagram::{
     Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, decode_joints, decode_pose,
     encode_joints, encode_pose, encode_scan,
@@ -55,6 +57,22 @@ pub fn datagrams(bytes: &[u8]) {
     joint_states(bytes);
 }
 
+/// Reads a line as a command to a base, and as its reply. What is accepted must be possible, and
+/// survive its own text.
+fn check_driving(line: &[u8]) {
+    let is_possible = |velocity: BaseVelocity| velocity.is_finite() && velocity.speed_m_s() < 200.0;
+    if let Ok(command) = decode_command(line) {
+        assert!(is_possible(command.velocity), "{command:?}");
+        let is_stop = command.velocity == BaseVelocity::ZERO;
+        assert!(is_stop || command.expires_nanos.is_some(), "{command:?}");
+        assert_eq!(decode_command(&encode_command(&command)), Ok(command));
+    }
+    if let Ok(reply) = decode_reply(line) {
+        assert!(is_possible(reply.velocity), "{reply:?}");
+        assert_eq!(decode_reply(&encode_reply(&reply)), Ok(reply));
+    }
+}
+
 /// Positions of the arm's joints received in the datagrams; see [`datagrams`].
 pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
     READERS.with_borrow_mut(|readers| {
@@ -71,6 +89,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
         let mut newest = [None; 3];
         let mut reported = Vec::new();
         for line in bytes.split(|byte| *byte == b'\n') {
+            check_driving(line);
             let millis = str::from_utf8(line)
                 .ok()
                 .and_then(|line| line.parse::<u32>().ok());

@@ -4,6 +4,11 @@
 
 mod arm;
 mod base;
+mod driven_base;
+#[cfg(test)]
+mod driven_base_tests;
+#[cfg(any(test, feature = "emulation"))]
+mod emulated_base;
 #[cfg(any(test, fuzzing))]
 pub(crate) mod fuzz;
 mod reader;
@@ -15,4 +20,7 @@ mod tests;
 pub use crate::datagrams::counts::{DatagramCounts, DatagramMonitor};
 pub use arm::UdpArm;
 pub use base::UdpBase;
+pub use driven_base::UdpDrivenBase;
+#[cfg(any(test, feature = "emulation"))]
+pub use emulated_base::EmulatedBase;
 pub use scanner::UdpScanner;

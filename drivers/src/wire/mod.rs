@@ -1,5 +1,6 @@
 //! Byte codecs. They consist of pure `encode` and `decode` functions without sockets and clocks.
 
+pub mod base_drive;
 pub mod can;
 pub mod datagram;
 pub mod descriptor;

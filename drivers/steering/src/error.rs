@@ -49,6 +49,12 @@ pub enum Error {
         /// Its message.
         why: String,
     },
+    /// The limits of a base are not valid.
+    #[error("steering: {why}")]
+    BaseLimits {
+        /// What is wrong.
+        why: String,
+    },
     /// The chain of joints rejects its values.
     #[error(transparent)]
     Kinematics(#[from] kinematics::Error),

@@ -18,6 +18,10 @@
 //! rest of the program. Acceleration and jerk are limited there, by the generator of
 //! [`drivers::motion`].
 //!
+//! A base has a chain of its own, [`BaseSteering`], with the same lease and the same dead-man switch.
+//! It decides about velocities and goals on the floor, and lets the base move only while the arm on
+//! it is stowed.
+//!
 //! Nothing here has a clock, a thread or a connection: every function takes the time. The same
 //! calls give the same decisions, bit for bit, so [`Steering::take_record`] gives records that
 //! [`Steering::replay`] repeats.
@@ -79,6 +83,12 @@
 //! ```
 
 mod analytic_scene;
+mod authority;
+mod base_area;
+mod base_goal;
+mod base_record;
+mod base_steering;
+mod base_verdict;
 mod body;
 mod capsule;
 mod check;
@@ -95,11 +105,15 @@ mod record;
 mod request;
 mod self_collision;
 mod steering;
+mod stowed;
 #[cfg(test)]
 mod tests;
 mod verdict;
 
 pub use analytic_scene::{AnalyticScene, Solid};
+pub use base_record::BaseEntry;
+pub use base_steering::{BaseSetup, BaseSteering, BaseSteeringConfig, BaseSteeringState};
+pub use base_verdict::{BaseSituation, BaseVerdict, FloorPose, SeenPose, SeenPosture};
 pub use body::Body;
 pub use capsule::{Capsule, Gap};
 pub use clearance::{Clearance, ClearanceConfig, ClearancePoints, Restriction, Seen};
@@ -115,6 +129,7 @@ pub use self_collision::{SelfCollision, SelfCollisionConfig};
 pub use steering::setup::Setup;
 pub use steering::state::State;
 pub use steering::{Robot, Steering, SteeringConfig};
+pub use stowed::Stowed;
 pub use verdict::Verdict;
 
 /// What passes between the chain and the arm's thread.

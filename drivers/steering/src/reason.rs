@@ -16,8 +16,10 @@ pub enum Link {
     SelfCollision,
     /// Distance to the scene.
     Clearance,
-    /// The arm itself.
+    /// The arm itself, also while the base moves.
     Arm,
+    /// The base itself.
+    Base,
 }
 
 /// What a link did.
@@ -53,7 +55,8 @@ impl std::fmt::Display for Limit {
     }
 }
 
-/// A reason in words. Places are points in the frame of the arm's base, in meters.
+/// A reason in words. Places are points in the frame of the arm's base, in meters; those of a base
+/// are in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, thiserror::Error)]
 pub enum Reason {
     /// Nobody holds the lease.
@@ -299,10 +302,78 @@ pub enum Reason {
         /// Place of the part.
         place: [f64; 3],
     },
+    /// A command for a base, but only an arm is steered.
+    #[error("no base is steered in this run: the command would move one")]
+    NoBase,
+    /// A command for an arm, but only a base is steered.
+    #[error("only the base is steered in this run: the command would move an arm")]
+    OnlyBase,
+    /// The base reports a fault.
+    #[error("the base stopped: {report}; clear the fault, then permit motion again")]
+    BaseStopped {
+        /// Report of the base.
+        report: String,
+    },
+    /// The base reports no state.
+    #[error("the base has reported no state for {silent_secs:.3} s")]
+    BaseSilent {
+        /// Time since the last report.
+        silent_secs: f64,
+    },
+    /// The base did not obey a velocity.
+    #[error("the base did not obey: {report}")]
+    BaseRefused {
+        /// Report of the base.
+        report: String,
+    },
+    /// The base braked without an order, because its target expired.
+    #[error("the base braked, because its target expired: grip again")]
+    BaseBraked,
+    /// The base is not yet at rest after the last grip.
+    #[error("the base is still braking")]
+    BaseStillBraking,
+    /// The base would move too fast.
+    #[error("the base would move too fast")]
+    BaseSpeed,
+    /// The base cannot move sideways.
+    #[error("the base cannot move sideways")]
+    NoSideways,
+    /// The pose of the base is needed, but not known.
+    #[error("the pose of the base has not been known for the last {max_age_secs} s")]
+    BasePoseUnknown {
+        /// Greatest age of a pose that counts.
+        max_age_secs: f64,
+    },
+    /// The base is close to the edge of its area.
+    #[error("the base is close to the edge of its area")]
+    AreaEdge {
+        /// Place of the base.
+        place: [f64; 3],
+    },
+    /// The goal is outside the area of the base.
+    #[error("the goal is outside the area of the base")]
+    GoalOutsideArea {
+        /// The goal.
+        place: [f64; 3],
+    },
+    /// The posture of the arm on the base is not known.
+    #[error("the posture of the arm is not known: the base moves only while it is stowed")]
+    ArmUnknown,
+    /// The arm on the base is not stowed.
+    #[error(
+        "joint {joint} is {offset:.2} from its stowed position: stow the arm before the base moves"
+    )]
+    ArmNotStowed {
+        /// Name of the joint.
+        joint: String,
+        /// Distance, radians or meters.
+        offset: f64,
+    },
 }
 
 impl Reason {
-    /// The place of the reason in the frame of the arm's base, meters.
+    /// The place of the reason in the frame of the arm's base, or in the world for reasons of a base,
+    /// meters.
     pub fn place(&self) -> Option<[f64; 3]> {
         match self {
             Self::PartSpeed { place, .. }
@@ -311,7 +382,9 @@ impl Reason {
             | Self::SelfCollision { place, .. }
             | Self::Near { place, .. }
             | Self::LongUnseen { place, .. }
-            | Self::NeverSeen { place, .. } => Some(*place),
+            | Self::NeverSeen { place, .. }
+            | Self::AreaEdge { place }
+            | Self::GoalOutsideArea { place } => Some(*place),
             _ => None,
         }
     }

@@ -97,6 +97,11 @@ pub struct Command {
 }
 
 impl Command {
+    /// Whether the command asks for a motion of a base instead of an arm.
+    pub(crate) fn moves_base(&self) -> bool {
+        self.grip.is_some() && self.intent.is_of_base()
+    }
+
     /// When the command arrived, but not after it is decided: clocks are rounded.
     pub(crate) fn received_by(&self, now: Stamp) -> Stamp {
         self.received_at.min(now)
@@ -140,9 +145,26 @@ pub enum Intent {
         #[serde(with = "exact::array")]
         angular_rad_s: [f64; 3],
     },
+    /// The base moves at a velocity, in its own frame.
+    BaseVelocity {
+        /// Forward and left in m/s, and the yaw rate in rad/s.
+        #[serde(with = "exact::array")]
+        velocity: [f64; 3],
+    },
+    /// The base moves to a pose on the floor.
+    BaseGoal {
+        /// x and y in meters and the heading in radians, in the world.
+        #[serde(with = "exact::array")]
+        world_from_goal: [f64; 3],
+    },
 }
 
 impl Intent {
+    /// Whether the intent is a motion of a base.
+    pub(crate) fn is_of_base(&self) -> bool {
+        matches!(self, Self::BaseVelocity { .. } | Self::BaseGoal { .. })
+    }
+
     /// Name of the kind, for messages.
     pub(crate) fn kind(&self) -> &'static str {
         match self {
@@ -151,6 +173,8 @@ impl Intent {
             Self::Joints { .. } => "joint positions",
             Self::JointVelocity { .. } => "joint velocities",
             Self::TipVelocity { .. } => "tip velocity",
+            Self::BaseVelocity { .. } => "base velocity",
+            Self::BaseGoal { .. } => "base goal",
         }
     }
 
@@ -165,6 +189,10 @@ impl Intent {
                 linear_m_s,
                 angular_rad_s,
             } => [*linear_m_s, *angular_rad_s].concat(),
+            Self::BaseVelocity { velocity: numbers }
+            | Self::BaseGoal {
+                world_from_goal: numbers,
+            } => numbers.to_vec(),
         }
     }
 

@@ -1,5 +1,6 @@
 //! The chain of decisions: lease, clutch, limits, self-collision, clearance.
 
+use crate::authority::check_operator_times;
 use crate::body::Body;
 use crate::capsule::Capsule;
 use crate::check::positive;
@@ -387,6 +388,7 @@ impl Steering {
                 self.clutch.open();
                 Ok(())
             }
+            Request::Command(command) if command.moves_base() => Err(Reason::NoBase),
             Request::Command(command) => self.take_command(now, command),
         }
     }
@@ -650,7 +652,10 @@ impl Steering {
                 let pose = moved_tip(base_from_tip, *linear_m_s, *angular_rad_s, pace.secs);
                 Some(Goal::Pose(pose))
             }
-            Intent::Hand { .. } | Intent::Pose { .. } => None,
+            Intent::Hand { .. }
+            | Intent::Pose { .. }
+            | Intent::BaseVelocity { .. }
+            | Intent::BaseGoal { .. } => None,
         }
     }
 
@@ -741,21 +746,7 @@ fn refused(link: Link, reason: Reason) -> Limit {
 }
 
 fn check_times(config: &SteeringConfig) -> Result<(), Error> {
-    let clutch = &config.clutch;
-    for (what, value) in [
-        ("lease.expiry_secs", config.lease.expiry_secs),
-        ("lease.offer_secs", config.lease.offer_secs),
-        ("clutch.max_silence_secs", clutch.max_silence_secs),
-        ("clutch.max_age_secs", clutch.max_age_secs),
-        ("clutch.max_ahead_secs", clutch.max_ahead_secs),
-        ("clutch.max_hand_m_s", clutch.max_hand_m_s),
-        ("clutch.max_hand_rad_s", clutch.max_hand_rad_s),
-        ("clutch.translation_scale", clutch.translation_scale),
-        ("clutch.rotation_scale", clutch.rotation_scale),
-        ("target_expiry_secs", config.target_expiry_secs),
-        ("max_arm_silence_secs", config.max_arm_silence_secs),
-    ] {
-        positive(what, value)?;
-    }
-    Ok(())
+    check_operator_times(&config.lease, &config.clutch)?;
+    positive("target_expiry_secs", config.target_expiry_secs)?;
+    positive("max_arm_silence_secs", config.max_arm_silence_secs)
 }

@@ -1,5 +1,6 @@
 //! Tests of the whole chain with a simulated clock.
 
+mod base_tests;
 mod clearance_tests;
 mod clutch_tests;
 mod late_start_tests;

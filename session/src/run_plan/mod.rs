@@ -30,11 +30,12 @@ use crate::resume_command::{FROM, REAL_TIME, REPEAT, ResumeCommand};
 use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
+use crate::steering::SteeredRobot;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
 use capture::RecordedMeshes;
 use capture::check_output_file;
 use capture::config::{ArmDriver, Need, Override, Rig};
-use capture::open::{self, Devices, Opened, SteeredArm};
+use capture::open::{self, Devices, Opened};
 use gpu::Gpu;
 use messages::{BadInput, Setting};
 use model_files::Edits;
@@ -150,7 +151,12 @@ impl RunPlan {
         let rig = plan.read_rig(&overrides)?;
         plan.require_calibration(&rig)?;
         if plan.is_steered {
-            open::check_steerable(&rig, plan.devices()?)?;
+            let devices = plan.devices()?;
+            if open::is_base_steered(&rig, devices) {
+                open::check_drivable(&rig, devices)?;
+            } else {
+                open::check_steerable(&rig, devices)?;
+            }
         }
         log::info!("{}", opening::describe(&plan.rig_name(), &rig, &plan.input));
         let kinds = methods_of(&rig)?;
@@ -441,8 +447,8 @@ impl RunPlan {
         }
     }
 
-    /// Opens the devices or the recording. Also returns the arm if it is steered.
-    fn open(&self, rig: Rig) -> anyhow::Result<(Opened, Option<SteeredArm>)> {
+    /// Opens the devices or the recording. Also returns the arm or the base if it is steered.
+    fn open(&self, rig: Rig) -> anyhow::Result<(Opened, Option<SteeredRobot>)> {
         let RunInput::Recording {
             path,
             is_real_time,
@@ -450,9 +456,13 @@ impl RunPlan {
         } = &self.input
         else {
             let devices = self.devices()?;
+            if self.is_steered && open::is_base_steered(&rig, devices) {
+                let (opened, base) = open::with_steered_base(rig, devices)?;
+                return Ok((opened, Some(SteeredRobot::Base(base))));
+            }
             if self.is_steered {
                 let (opened, arm) = open::steered(rig, devices)?;
-                return Ok((opened, Some(arm)));
+                return Ok((opened, Some(SteeredRobot::Arm(arm))));
             }
             return Ok((open::rig(rig, devices)?, None));
         };

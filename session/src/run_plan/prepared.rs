@@ -10,11 +10,11 @@ use crate::robot_meshes;
 use crate::run_folder::CreatedFolders;
 use crate::session::{Evaluators, Session};
 use crate::session_setup::{Services, SessionSetup};
-use crate::steering::PreparedSteering;
+use crate::steering::{PreparedRobot, SteeredRobot};
 use crate::training_clock::Clock;
 use crate::viewers::{Viewers, gpu_notes};
 use capture::config::Rig;
-use capture::open::{self, Opened, SteeredArm};
+use capture::open::{self, Opened};
 use capture::{
     Feed, Input, InputObserver, Join, Notes, RecordedMeshes, RobotMotion, StampClock, Stations,
     doctor,
@@ -47,8 +47,8 @@ pub struct PreparedRun<'a> {
 /// A run whose devices are open.
 pub struct OpenedRun<'a> {
     opened: Opened,
-    /// The arm, if operators may steer it.
-    steered_arm: Option<SteeredArm>,
+    /// The arm or the base, if operators may steer it.
+    steered: Option<SteeredRobot>,
     /// Mesh files of the robot; `None` if the run is not recorded.
     meshes: Option<RecordedMeshes>,
     device_notes: Notes,
@@ -116,10 +116,10 @@ impl<'a> PreparedRun<'a> {
         // Devices do not wait, so meshes are compressed before they are opened. A recording waits,
         // and may contain the meshes.
         let of_devices = plan.recording().is_none().then(|| plan.meshes(&self.rig));
-        let (opened, steered_arm) = plan.open(self.rig)?;
+        let (opened, steered) = plan.open(self.rig)?;
         let meshes = of_devices.unwrap_or_else(|| plan.meshes(&opened.rig));
         Ok(OpenedRun {
-            steered_arm,
+            steered,
             meshes,
             opened: opened.with_tag_check(&device_notes)?,
             device_notes,
@@ -146,7 +146,7 @@ impl OpenedRun<'_> {
     fn start_in(self, created: &mut CreatedFolders) -> anyhow::Result<RunInProgress> {
         let Self {
             opened,
-            steered_arm,
+            steered,
             meshes,
             device_notes,
             parts,
@@ -179,12 +179,12 @@ impl OpenedRun<'_> {
         let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), devices, held)?;
         input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig)?;
-        let steering = steered_arm
-            .map(|arm| PreparedSteering::new(arm, &rig))
+        let steering = steered
+            .map(|robot| PreparedRobot::new(robot, &rig))
             .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
-        let clearance = steering.as_ref().map(PreparedSteering::clearance_feed);
+        let clearance = steering.as_ref().and_then(PreparedRobot::clearance_feed);
         let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
         let steering = steering
             .map(|steering| steering.start(&hub, Some(run_folder_of(&folders))))
@@ -251,10 +251,10 @@ impl OpenedRun<'_> {
 }
 
 /// What receives the data of the devices besides the trainer.
-fn observer(hub: &Hub, steering: Option<&PreparedSteering>) -> Box<dyn InputObserver> {
+fn observer(hub: &Hub, steering: Option<&PreparedRobot>) -> Box<dyn InputObserver> {
     let viewers = Viewers(hub.clone());
     match steering {
-        Some(steering) => Box::new(steering.observer(viewers)),
+        Some(steering) => steering.observer(viewers),
         None => Box::new(viewers),
     }
 }

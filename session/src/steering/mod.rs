@@ -4,10 +4,13 @@
 //! with the chain of the crate `steering` what the arm does, and sends it to the arm's own thread,
 //! which brakes as soon as targets expire. The thread needs neither the trainer nor the GPU, so
 //! both may be busy for any time. `steering_loop.rs` has one cycle, and the other files its parts.
+//! The folder `base` does the same for a base.
 
+mod base;
 mod clearance_feed;
 mod joint_map;
 mod observer;
+mod prepared_robot;
 mod previews;
 mod recovery;
 mod requests;
@@ -26,6 +29,7 @@ mod undrawn;
 
 pub(crate) use clearance_feed::{ClearanceFeed, MIN_STEPS};
 pub(crate) use observer::SteeringObserver;
+pub(crate) use prepared_robot::{PreparedRobot, SteeredRobot};
 pub use standalone::steer_standalone;
 pub use surroundings::Surroundings;
 
@@ -172,6 +176,7 @@ impl<S: Surroundings> PreparedSteering<S> {
             expiry_secs: self.config.clutch.max_silence_secs,
             lease_secs: self.config.lease.expiry_secs,
             servo_round_trip_millis: self.servo_round_trip_millis,
+            base: None,
         }
     }
 }

@@ -45,6 +45,20 @@ fn intent(intent: &SteeringIntent) -> Intent {
             linear_m_s,
             angular_rad_s,
         },
+        SteeringIntent::BaseVelocity {
+            forward_m_s,
+            left_m_s,
+            yaw_rad_s,
+        } => Intent::BaseVelocity {
+            velocity: [forward_m_s, left_m_s, yaw_rad_s],
+        },
+        SteeringIntent::BaseGoal {
+            x_m,
+            y_m,
+            heading_rad,
+        } => Intent::BaseGoal {
+            world_from_goal: [x_m, y_m, heading_rad],
+        },
     }
 }
 
@@ -77,6 +91,7 @@ pub(super) fn applied_limit(limit: &Limit) -> AppliedLimit {
         Link::SelfCollision => LimitLink::SelfCollision,
         Link::Clearance => LimitLink::Clearance,
         Link::Arm => LimitLink::Arm,
+        Link::Base => LimitLink::Base,
     };
     AppliedLimit {
         link,

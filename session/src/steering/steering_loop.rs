@@ -417,6 +417,7 @@ impl SteeringLoop {
             limits: verdict.limits.iter().map(requests::applied_limit).collect(),
             applied: self.applied,
             contacts: None,
+            base: None,
         })
     }
 }

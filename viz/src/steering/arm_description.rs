@@ -18,6 +18,22 @@ pub struct ArmDescription {
     /// Round trip from which on a page should show goals before the arm moves, instead of moving the
     /// arm with the hand.
     pub servo_round_trip_millis: f64,
+    /// The base, if it is steered. There are then no joints.
+    pub base: Option<BaseDescription>,
+}
+
+/// What clients need to know about a base before they drive it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct BaseDescription {
+    /// Largest speed forward and backward, m/s.
+    pub max_forward_m_s: f64,
+    /// Largest speed to the sides, m/s; 0 if the base cannot move sideways.
+    pub max_left_m_s: f64,
+    /// Largest yaw rate, rad/s.
+    pub max_yaw_rad_s: f64,
+    /// Rectangle on the floor that the base stays in: smallest x and y, then largest x and y, in the
+    /// world, meters.
+    pub area_m: Option<[f64; 4]>,
 }
 
 /// A joint that an operator moves.

@@ -158,6 +158,16 @@ enum IntentMessage {
         linear_m_s: [f64; 3],
         angular_rad_s: [f64; 3],
     },
+    BaseVelocity {
+        forward_m_s: f64,
+        left_m_s: f64,
+        yaw_rad_s: f64,
+    },
+    BaseGoal {
+        x_m: f64,
+        y_m: f64,
+        heading_rad: f64,
+    },
 }
 
 /// Fields of `preview`.
@@ -317,6 +327,30 @@ fn check_intent(intent: IntentMessage, n_joints: usize) -> Result<SteeringIntent
             SteeringIntent::TipVelocity {
                 linear_m_s,
                 angular_rad_s,
+            }
+        }
+        IntentMessage::BaseVelocity {
+            forward_m_s,
+            left_m_s,
+            yaw_rad_s,
+        } => {
+            check_numbers("the velocity", &[forward_m_s, left_m_s, yaw_rad_s])?;
+            SteeringIntent::BaseVelocity {
+                forward_m_s,
+                left_m_s,
+                yaw_rad_s,
+            }
+        }
+        IntentMessage::BaseGoal {
+            x_m,
+            y_m,
+            heading_rad,
+        } => {
+            check_numbers("the goal", &[x_m, y_m, heading_rad])?;
+            SteeringIntent::BaseGoal {
+                x_m,
+                y_m,
+                heading_rad,
             }
         }
     })

@@ -110,6 +110,16 @@ fn check_command(command: &SteeringCommand, now: Instant) {
             check_numbers(linear_m_s);
             check_numbers(angular_rad_s);
         }
+        Some(SteeringIntent::BaseVelocity {
+            forward_m_s,
+            left_m_s,
+            yaw_rad_s,
+        }) => check_numbers(&[*forward_m_s, *left_m_s, *yaw_rad_s]),
+        Some(SteeringIntent::BaseGoal {
+            x_m,
+            y_m,
+            heading_rad,
+        }) => check_numbers(&[*x_m, *y_m, *heading_rad]),
     }
 }
 

@@ -70,7 +70,7 @@ pub struct SteeringCommand {
     pub intent: Option<SteeringIntent>,
 }
 
-/// Where the arm should move.
+/// Where the arm or the base should move.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SteeringIntent {
     /// The tip makes the same motion as the hand since the start of the grip.
@@ -99,6 +99,24 @@ pub enum SteeringIntent {
         linear_m_s: [f64; 3],
         /// Angular velocity of the tip.
         angular_rad_s: [f64; 3],
+    },
+    /// The base moves at a velocity, in its own frame.
+    BaseVelocity {
+        /// Forward, m/s.
+        forward_m_s: f64,
+        /// To the left, m/s.
+        left_m_s: f64,
+        /// Counterclockwise seen from above, rad/s.
+        yaw_rad_s: f64,
+    },
+    /// The base moves to a pose on the floor of the world.
+    BaseGoal {
+        /// x of the base link, meters.
+        x_m: f64,
+        /// y of the base link, meters.
+        y_m: f64,
+        /// Direction of its x axis, counterclockwise from the x axis of the world.
+        heading_rad: f64,
     },
 }
 

@@ -4,7 +4,7 @@ use crate::clock::ServerClock;
 use crate::steering::arm_description::ArmDescription;
 use crate::steering::preview::Preview;
 use crate::steering::request::RefusedRequest;
-use crate::steering::state::{AppliedLimit, SteeringState};
+use crate::steering::state::{AppliedLimit, SteeredBaseState, SteeringState};
 use crate::topics::operator_status::ConnectedClient;
 use axum::extract::ws::Message;
 use serde::Serialize;
@@ -55,6 +55,7 @@ pub(crate) struct StateMessage<'a> {
     limits: &'a [AppliedLimit],
     applied: Option<AppliedMessage>,
     contacts: Option<u64>,
+    base: Option<&'a SteeredBaseState>,
     clients: &'a [ConnectedClient],
 }
 
@@ -95,6 +96,7 @@ impl<'a> SteeringMessage<'a> {
                 applied_micros: micros(clock.millis(applied.applied_at)),
             }),
             contacts: state.contacts,
+            base: state.base.as_ref(),
             clients,
         }))
     }

@@ -38,6 +38,24 @@ pub struct SteeringState {
     pub applied: Option<AppliedCommand>,
     /// Contacts of the robot with the scene so far; `None` if they are not known, as for a real arm.
     pub contacts: Option<u64>,
+    /// State of the base, if it is steered.
+    pub base: Option<SteeredBaseState>,
+}
+
+/// State of a base that is steered, as clients receive it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SteeredBaseState {
+    /// Pose on the floor of the world: x and y in meters, and the heading in radians; `None` if it is
+    /// not known.
+    pub world_from_base: Option<[f64; 3]>,
+    /// Measured velocity: forward and left in m/s, and the yaw rate in rad/s.
+    pub velocity: [f64; 3],
+    /// The velocity that the base should have, if it follows an operator.
+    pub target: Option<[f64; 3]>,
+    /// The goal of the operator: x and y in meters, and the heading in radians, in the world.
+    pub goal: Option<[f64; 3]>,
+    /// Whether the base is at the goal.
+    pub has_arrived: bool,
 }
 
 /// A limit that slows the arm down or keeps it from moving.
@@ -51,7 +69,7 @@ pub struct AppliedLimit {
     pub speed_scale: f64,
     /// Why, in one sentence.
     pub text: String,
-    /// Where, meters in the frame of the arm's base.
+    /// Where, meters in the frame of the arm's base; for limits of a base, in the world.
     pub place: Option<[f64; 3]>,
 }
 
@@ -69,8 +87,10 @@ pub enum LimitLink {
     SelfCollision,
     /// Distance from the scene.
     Clearance,
-    /// The arm itself.
+    /// The arm itself, also while the base moves.
     Arm,
+    /// The base itself.
+    Base,
 }
 
 /// What a limit does.

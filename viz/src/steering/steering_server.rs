@@ -258,6 +258,7 @@ mod tests {
             expiry_secs: 0.12,
             lease_secs: 5.0,
             servo_round_trip_millis: 120.0,
+            base: None,
         });
         for (client, role) in [
             (HOLDER, Role::Operator),

@@ -256,6 +256,7 @@ fn states_have_all_fields_on_the_servers_clock() {
             applied_at: received.captured_at + Duration::from_millis(20),
         }),
         contacts: Some(3),
+        base: None,
         ..state()
     });
     let mut message = client.next_of("state");

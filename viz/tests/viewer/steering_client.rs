@@ -32,6 +32,7 @@ pub(crate) fn arm(lease_secs: f64) -> Arc<SteeringServer> {
         expiry_secs: 0.12,
         lease_secs,
         servo_round_trip_millis: 80.0,
+        base: None,
     })
 }
 
@@ -53,6 +54,7 @@ pub(crate) fn state() -> SteeringState {
         limits: Vec::new(),
         applied: None,
         contacts: None,
+        base: None,
     }
 }
 

@@ -80,6 +80,7 @@ impl ScriptedArm {
             expiry_secs: EXPIRY_SECS,
             lease_secs: 1e3,
             servo_round_trip_millis,
+            base: None,
         });
         let script: Arc<Mutex<Script>> = Arc::default();
         let is_over: Arc<AtomicBool> = Arc::default();
@@ -192,6 +193,7 @@ fn state(script: &Script) -> SteeringState {
         limits: script.limits.clone(),
         applied: None,
         contacts: None,
+        base: None,
     }
 }
 

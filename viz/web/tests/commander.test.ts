@@ -5,7 +5,7 @@ import { Commander } from "../src/steering/commander";
 import { NO_DEFLECTION } from "../src/steering/jog";
 import type { SteerMessage, SteerRequest, SteerState } from "../src/steering/messages";
 import { poseOf } from "../src/steering/pose";
-import { ARM, CLIENT, STATE } from "./steering_examples";
+import { ARM, BASE, CLIENT, STATE } from "./steering_examples";
 import { assertClose, fakeClock } from "./close";
 
 type Command = SteerRequest & { type: "command" };
@@ -406,4 +406,62 @@ test("everybody needs the stop button while somebody has control or the arm move
   assert.equal(bench.commander.canMove, false);
   bench.state({ holder: null, is_moving: true });
   assert.equal(bench.commander.canMove, true);
+});
+
+const BASE_STATE = { world_from_base: [0, 0, 0.5], goal: null, has_arrived: false } satisfies SteerState["base"];
+
+/** A bench whose server steers a base. */
+function withBase(): Partial<SteerState> {
+  bench.commander.receive(BASE, bench.clock.millis);
+  bench.commander.frame = "view";
+  const state = { position: [], base: BASE_STATE };
+  bench.run(1500, state);
+  return state;
+}
+
+test("a base is driven with the same switch, in its own frame, also over a slow link", () => {
+  bench.roundTripMillis = 400;
+  const state = withBase();
+  assert.equal(bench.commander.mode, "servo");
+  bench.commander.setJog("keys", { kind: "tip", deflection: { ...NO_DEFLECTION, forward: 1, right: 1 } });
+  bench.run(100, state);
+  const { intent, grip } = bench.last();
+  assert.equal(grip, 1);
+  // It cannot move sideways, so it turns to the right.
+  assert.deepEqual(intent, { kind: "base_velocity", forward_m_s: 0.5 * 0.3, left_m_s: 0, yaw_rad_s: -0.3 });
+  bench.commander.setJog("keys", null);
+  assert.equal(bench.last().grip, null);
+  assert.equal(bench.commander.gizmo, null, "there is no hand");
+});
+
+test("a base goes to its goal while go is held, and the goal is done after the release there", () => {
+  const state = withBase();
+  const { commander } = bench;
+  commander.setBaseGoal([2, 0, 0]);
+  assert.ok(!commander.mayGoToBaseGoal, "it is outside the area");
+  commander.setGo(true);
+  assert.equal(bench.last().grip, null);
+  commander.setGo(false);
+  commander.setBaseGoal([0.5, -0.5, 1]);
+  commander.setGo(true);
+  bench.run(100, state);
+  assert.deepEqual(bench.last().intent, { kind: "base_goal", x_m: 0.5, y_m: -0.5, heading_rad: 1 });
+  bench.run(40, { ...state, base: { ...BASE_STATE, has_arrived: true } });
+  assert.notEqual(commander.baseGoal, null, "it is still held");
+  commander.setGo(false);
+  bench.run(40, state);
+  assert.equal(commander.baseGoal, null);
+});
+
+test("another goal opens the switch, and lost control removes it", () => {
+  const state = withBase();
+  const { commander } = bench;
+  commander.setBaseGoal([0.5, 0, 0]);
+  commander.setGo(true);
+  bench.run(40, state);
+  assert.notEqual(bench.last().grip, null);
+  commander.setBaseGoal([0.6, 0, 0]);
+  assert.equal(bench.last().grip, null);
+  bench.run(40, { ...state, holder: 3 });
+  assert.equal(commander.baseGoal, null);
 });

@@ -47,6 +47,15 @@ test("a list is read with its postures and places", () => {
   assert.equal(lackText(list), "");
 });
 
+test("the robot of a steered base has its own pose at each time", () => {
+  const pose = [1, 2, 0.5, 0, 0, 0, 1];
+  const incidents = [{ ...LIST.incidents[0], world_from_base: pose }];
+  const track = [{ seconds: 1, position: [], target: null, world_from_base: pose }];
+  const list = parseIncidents({ ...LIST, joint_names: [], incidents, track })!;
+  assert.deepEqual([list.incidents[0]!.worldFromBase, list.track[0]!.worldFromBase], [pose, pose]);
+  assert.equal(parseIncidents(LIST)!.incidents[0]!.worldFromBase, null);
+});
+
 test("joints are found by their names, in any order", () => {
   const list = parseIncidents(LIST)!;
   assert.deepEqual(positionsFor(["finger", "j2", "j1"], list, [0.5, -0.5]), [0, -0.5, 0.5]);

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { parseMessage } from "../src/steering/messages";
-import { ARM, STATE } from "./steering_examples";
+import { ARM, BASE, STATE } from "./steering_examples";
 
 function parsed(message: object): unknown {
   return parseMessage(JSON.stringify(message));
@@ -17,6 +17,16 @@ test("complete messages are read", () => {
   const preview = { type: "preview", id: 3, verdict: "never seen", text: "no data", position: null, place: [1, 2, 3] };
   assert.deepEqual(parsed(preview), preview);
   assert.deepEqual(parsed({ type: "pong", id: 1, time_micros: 2.5 }), { type: "pong", id: 1, time_micros: 2.5 });
+});
+
+test("a base needs no joints, and damaged parts of it are left out", () => {
+  assert.deepEqual(parsed(BASE), BASE);
+  assert.equal(parsed({ ...BASE, base: { ...BASE.base, max_yaw_rad_s: "fast" } }), null);
+  assert.deepEqual(parsed({ ...BASE, base: { ...BASE.base, area_m: [0, 1] } }), { ...BASE, base: { ...BASE.base, area_m: null } });
+  const base = { world_from_base: [1, 2, 3], goal: [4, 5, 6], has_arrived: true };
+  assert.deepEqual(parsed({ ...STATE, position: [], base }), { ...STATE, position: [], base });
+  const damaged = parsed({ ...STATE, base: { ...base, goal: [4, null, 6], has_arrived: 1 } }) as typeof STATE;
+  assert.deepEqual(damaged.base, { ...base, goal: null, has_arrived: false });
 });
 
 test("fields that are missing or new do not matter", () => {

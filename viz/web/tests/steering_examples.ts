@@ -17,6 +17,14 @@ export const ARM: Arm = {
   expiry_secs: 0.12,
   lease_secs: 5,
   servo_round_trip_millis: 100,
+  base: null,
+};
+
+/** A base that cannot move sideways. */
+export const BASE: Arm = {
+  ...ARM,
+  joints: [],
+  base: { max_forward_m_s: 0.5, max_left_m_s: 0, max_yaw_rad_s: 1, area_m: [-1, -1, 1, 1] },
 };
 
 /** This client has control, and the arm is at rest. */
@@ -37,5 +45,6 @@ export const STATE: SteerState = {
   limits: [],
   applied: null,
   contacts: 0,
+  base: null,
   clients: [{ id: CLIENT, role: "operator" }],
 };

@@ -1,6 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { stopText } from "../src/steering/texts";
+import { baseGoalText, baseText, leaseText, stopText } from "../src/steering/texts";
 import { STATE } from "./steering_examples";
 
 test("a stop is shown also while the arm is being recovered", () => {
@@ -11,4 +11,13 @@ test("a stop is shown also while the arm is being recovered", () => {
   assert.match(recovering, /being recovered/);
   assert.match(recovering, /stopped by operator 2/);
   assert.match(stopText({ ...STATE, is_recovering: true }), /being recovered\. .*stops it\.$/);
+});
+
+test("texts name the base if it is steered", () => {
+  const base = { world_from_base: null, goal: null, has_arrived: false };
+  assert.equal(stopText({ ...STATE, stop: "bumper", base }), "The base is stopped: bumper");
+  assert.equal(leaseText({ ...STATE, holder: null }, 7, "base"), "Nobody has control of the base");
+  assert.equal(baseText(12.4), "The base moves while you hold (12 ms)");
+  assert.equal(baseGoalText(false, false), "The goal is outside the area of the base");
+  assert.equal(baseGoalText(true, true), "The base is at the goal");
 });

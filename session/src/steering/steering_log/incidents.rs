@@ -1,14 +1,14 @@
 //! Incidents in a steering log: changes of control, stops, brakes, refusals, and where the arm
 //! was.
 
-use super::line::{Line, Start};
+use super::line::{BaseStart, Line, Start};
 use super::reader::LogReader;
 use kinematics::{Chain, Stamp};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::mem::{Discriminant, discriminant};
 use std::path::{Path, PathBuf};
-use steering::{Effect, Entry, Limit, Link, Operator, Reason, Request, Verdict};
+use steering::{BaseEntry, Effect, Entry, Limit, Link, Operator, Reason, Request, SeenPose};
 
 /// Number of incidents that are kept, the newest ones.
 const MAX_INCIDENTS: usize = 2000;
@@ -65,6 +65,9 @@ pub struct Incident {
     pub target: Option<Vec<f64>>,
     /// View of the operator, `world_from_camera`: x, y, z in meters, and a quaternion x, y, z, w.
     pub view: Option<[f64; 7]>,
+    /// Pose of the base, if it is steered: x, y, z in meters, and a quaternion x, y, z, w.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub world_from_base: Option<[f64; 7]>,
 }
 
 /// The kind of an incident.
@@ -75,7 +78,7 @@ pub enum IncidentKind {
     Lease,
     /// The arm was stopped until an operator permits motion, or motion was permitted again.
     Stop,
-    /// The arm braked while it followed an operator.
+    /// The robot braked while it followed an operator.
     Brake,
     /// A request, or a part of a motion, was refused.
     Refused,
@@ -107,6 +110,9 @@ pub struct Sample {
     pub position: Vec<f64>,
     /// The target, rounded like the positions; `None` if the arm followed none.
     pub target: Option<Vec<f64>>,
+    /// Pose of the base, if it is steered, rounded like the positions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub world_from_base: Option<[f64; 7]>,
 }
 
 /// State of the log up to a line.
@@ -117,7 +123,12 @@ struct History {
     now: Stamp,
     position: Vec<f64>,
     target: Option<Vec<f64>>,
-    verdict: Option<Verdict>,
+    /// The last decision; `None` before the first, and after missing entries.
+    decided: Option<Decided>,
+    /// Whether the log is that of a base.
+    is_base: bool,
+    /// Its pose.
+    world_from_base: Option<[f64; 7]>,
     holder: Option<Operator>,
     view: Option<[f64; 7]>,
     /// The track of the last seconds, in case that an incident follows.
@@ -128,6 +139,13 @@ struct History {
     tracked_until_secs: f64,
     /// Limits and refusals that were applied last at a time.
     episodes: Vec<(Episode, Stamp)>,
+}
+
+/// What matters of a decision.
+struct Decided {
+    limits: Vec<Limit>,
+    /// Whether the robot followed an operator.
+    is_following: bool,
 }
 
 /// Limits or refusals with equal episodes belong to one incident. Their numbers may differ.
@@ -144,8 +162,10 @@ impl History {
             match line {
                 Line::Start(start) => self.start(&start),
                 Line::Entry(entry) => self.entry(&entry),
+                Line::BaseStart(start) => self.start_base(&start),
+                Line::BaseEntry(entry) => self.base_entry(&entry),
                 Line::View(view) => self.view = Some(view.world_from_camera),
-                Line::Missing(_) => self.verdict = None,
+                Line::Missing(_) => self.decided = None,
                 Line::End(end) => self.advance(end.at),
             }
         }
@@ -154,17 +174,32 @@ impl History {
     }
 
     fn start(&mut self, start: &Start) {
-        if self.began.is_none() {
-            self.began = Some(start.at);
-            self.found.began_unix_millis = start.unix_millis;
-        }
-        self.found.program.clone_from(&start.program);
+        self.begin(start.at, start.unix_millis, &start.program);
         self.found.world_from_base = start.world_from_base;
         let setup = &start.setup;
         if let Ok(chain) = Chain::from_urdf(&setup.urdf, &setup.base_link, &setup.tip_link) {
             self.found.joint_names = chain.joint_names().to_vec();
         }
         self.advance(start.at);
+    }
+
+    /// Places of a base are in the world.
+    fn start_base(&mut self, start: &BaseStart) {
+        self.begin(start.at, start.unix_millis, &start.program);
+        self.found.world_from_base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+        self.is_base = true;
+        if let Some(stowed) = &start.setup.config.stowed {
+            self.found.joint_names.clone_from(&stowed.joints);
+        }
+        self.advance(start.at);
+    }
+
+    fn begin(&mut self, at: Stamp, unix_millis: u64, program: &str) {
+        if self.began.is_none() {
+            self.began = Some(at);
+            self.found.began_unix_millis = unix_millis;
+        }
+        program.clone_into(&mut self.found.program);
     }
 
     fn advance(&mut self, at: Stamp) {
@@ -180,19 +215,53 @@ impl History {
                 refusal,
             } => {
                 self.advance(*at);
-                match refusal {
-                    Some(reason) => self.refusal(request, reason),
-                    None => self.request(request),
-                }
+                self.answer(request, refusal.as_ref());
             }
             Entry::Cycle {
                 at, arm, verdict, ..
             } => {
                 self.advance(*at);
                 self.position.clone_from(&arm.position);
-                self.cycle(verdict);
+                let target = verdict.target();
+                self.cycle(&verdict.limits, target.is_some());
+                self.target = target.map(|target| target.position.clone());
                 self.sample();
             }
+        }
+    }
+
+    fn base_entry(&mut self, entry: &BaseEntry) {
+        match entry {
+            BaseEntry::Request {
+                at,
+                request,
+                refusal,
+            } => {
+                self.advance(*at);
+                self.answer(request, refusal.as_ref());
+            }
+            BaseEntry::Cycle {
+                at,
+                situation,
+                verdict,
+            } => {
+                self.advance(*at);
+                if let Some(seen) = &situation.pose {
+                    self.world_from_base = Some(pose_numbers(seen));
+                }
+                if let Some(arm) = &situation.arm {
+                    self.position.clone_from(&arm.position);
+                }
+                self.cycle(&verdict.limits, verdict.target().is_some());
+                self.sample();
+            }
+        }
+    }
+
+    fn answer(&mut self, request: &Request, refusal: Option<&Reason>) {
+        match refusal {
+            Some(reason) => self.refusal(request, reason),
+            None => self.request(request),
         }
     }
 
@@ -234,7 +303,12 @@ impl History {
             }
             Request::Stop { by } => {
                 let who = by.map_or("the program".to_owned(), |operator| operator.to_string());
-                self.add(IncidentKind::Stop, format!("{who} stopped the arm"), None);
+                let what = if self.is_base { "base" } else { "arm" };
+                self.add(
+                    IncidentKind::Stop,
+                    format!("{who} stopped the {what}"),
+                    None,
+                );
             }
             Request::Rearm { operator, .. } => {
                 let text = format!("{operator} permitted motion again");
@@ -248,9 +322,12 @@ impl History {
         }
     }
 
-    fn cycle(&mut self, verdict: &Verdict) {
-        let before = self.verdict.replace(verdict.clone());
-        for limit in &verdict.limits {
+    fn cycle(&mut self, limits: &[Limit], is_following: bool) {
+        let before = self.decided.replace(Decided {
+            limits: limits.to_vec(),
+            is_following,
+        });
+        for limit in limits {
             match limit.effect {
                 Effect::Braked => self.brake(limit, before.as_ref()),
                 Effect::Refused => {
@@ -265,25 +342,26 @@ impl History {
                 Effect::Slowed(_) => {}
             }
         }
-        self.target = verdict.target().map(|target| target.position.clone());
     }
 
     /// The arm must be at rest in this cycle.
-    fn brake(&mut self, limit: &Limit, before: Option<&Verdict>) {
+    fn brake(&mut self, limit: &Limit, before: Option<&Decided>) {
         let reason = &limit.reason;
         let is_same = |other: &Limit| {
             other.effect == Effect::Braked && discriminant(&other.reason) == discriminant(reason)
         };
-        let is_new = before.is_none_or(|verdict| !verdict.limits.iter().any(is_same));
-        let was_following = before.is_some_and(|verdict| verdict.target().is_some());
+        let is_new = before.is_none_or(|before| !before.limits.iter().any(is_same));
+        let was_following = before.is_some_and(|before| before.is_following);
         let kind = match reason {
             // The request itself is an incident.
             Reason::StoppedBy { .. } | Reason::StoppedByProgram | Reason::LeaseGivenUp { .. } => {
                 return;
             }
             Reason::LeaseExpired { .. } | Reason::ClockWentBack { .. } => IncidentKind::Lease,
-            Reason::ArmStopped { .. } => IncidentKind::Stop,
-            Reason::ArmSilent { .. } | Reason::ArmReport { .. } => IncidentKind::Brake,
+            Reason::ArmStopped { .. } | Reason::BaseStopped { .. } => IncidentKind::Stop,
+            Reason::ArmSilent { .. } | Reason::ArmReport { .. } | Reason::BaseSilent { .. } => {
+                IncidentKind::Brake
+            }
             _ if was_following => IncidentKind::Brake,
             _ => return,
         };
@@ -310,6 +388,7 @@ impl History {
             seconds,
             position: rounded(&self.position),
             target: self.target.as_deref().map(rounded),
+            world_from_base: self.world_from_base,
         };
         if seconds <= self.tracked_until_secs {
             self.track(sample);
@@ -364,6 +443,7 @@ impl History {
             position: self.position.clone(),
             target: self.target.clone(),
             view: self.view,
+            world_from_base: self.world_from_base,
         });
         self.tracked_until_secs = self.found.seconds + TRACKED_AFTER_SECS;
         for sample in std::mem::take(&mut self.recent) {
@@ -377,9 +457,16 @@ impl History {
 }
 
 fn rounded(positions: &[f64]) -> Vec<f64> {
+    positions.iter().map(|q| rounded_number(*q)).collect()
+}
+
+fn rounded_number(number: f64) -> f64 {
     const STEPS: f64 = 1e4;
-    positions
-        .iter()
-        .map(|q| (q * STEPS).round() / STEPS)
-        .collect()
+    (number * STEPS).round() / STEPS
+}
+
+/// A pose on the floor as x, y, z and a quaternion x, y, z, w.
+fn pose_numbers(seen: &SeenPose) -> [f64; 7] {
+    let (sin, cos) = (0.5 * seen.pose.yaw_rad).sin_cos();
+    [seen.pose.x_m, seen.pose.y_m, seen.z_m, 0.0, 0.0, sin, cos].map(rounded_number)
 }

@@ -3,20 +3,24 @@
 use drivers::motion::exact;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use steering::{Entry, Setup};
+use steering::{BaseEntry, BaseSetup, Entry, Setup};
 
 /// Version of the format. Logs of other versions are refused, because their replay would differ.
-pub(super) const VERSION: u64 = 1;
+pub(in crate::steering) const VERSION: u64 = 1;
 
 /// One line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Line {
+pub(in crate::steering) enum Line {
     /// The first line, and the first one after missing entries: the chain of decisions with its
     /// state.
     Start(Box<Start>),
     /// A request or a cycle.
     Entry(Box<Entry>),
+    /// The first line of the log of a base, and the first one after missing entries.
+    BaseStart(Box<BaseStart>),
+    /// A request or a cycle of a base.
+    BaseEntry(Box<BaseEntry>),
     /// New view of the holder of the lease.
     View(View),
     /// Entries are missing here, because the disk was too slow.
@@ -28,38 +32,55 @@ pub(super) enum Line {
 /// Setup for all further lines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Start {
+pub(in crate::steering) struct Start {
     /// [`VERSION`].
-    pub(super) version: u64,
+    pub(in crate::steering) version: u64,
     /// Version and processor of the program.
-    pub(super) program: String,
+    pub(in crate::steering) program: String,
     /// Now on the clock of the entries.
     #[serde(with = "exact::stamp")]
-    pub(super) at: Stamp,
+    pub(in crate::steering) at: Stamp,
     /// The same moment on the wall clock, milliseconds since 1970.
-    pub(super) unix_millis: u64,
+    pub(in crate::steering) unix_millis: u64,
     /// Pose of the base of the arm: x, y, z in meters, and a quaternion x, y, z, w.
-    pub(super) world_from_base: [f64; 7],
+    pub(in crate::steering) world_from_base: [f64; 7],
     /// Configuration, robot, limits and state.
-    pub(super) setup: Setup,
+    pub(in crate::steering) setup: Setup,
+}
+
+/// Setup of a base for all further lines.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::steering) struct BaseStart {
+    /// [`VERSION`].
+    pub(in crate::steering) version: u64,
+    /// Version and processor of the program.
+    pub(in crate::steering) program: String,
+    /// Now on the clock of the entries.
+    #[serde(with = "exact::stamp")]
+    pub(in crate::steering) at: Stamp,
+    /// The same moment on the wall clock, milliseconds since 1970.
+    pub(in crate::steering) unix_millis: u64,
+    /// Configuration, limits and state.
+    pub(in crate::steering) setup: BaseSetup,
 }
 
 /// A time on the clock of the entries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Moment {
+pub(in crate::steering) struct Moment {
     /// The time.
     #[serde(with = "exact::stamp")]
-    pub(super) at: Stamp,
+    pub(in crate::steering) at: Stamp,
 }
 
 /// The pose of an operator's eye.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct View {
+pub(in crate::steering) struct View {
     /// When it arrived.
     #[serde(with = "exact::stamp")]
-    pub(super) at: Stamp,
+    pub(in crate::steering) at: Stamp,
     /// Number of the operator.
-    pub(super) operator: u64,
+    pub(in crate::steering) operator: u64,
     /// x, y, z in meters, and a quaternion x, y, z, w; the camera is x right, y down, z forward.
-    pub(super) world_from_camera: [f64; 7],
+    pub(in crate::steering) world_from_camera: [f64; 7],
 }

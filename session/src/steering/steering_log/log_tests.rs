@@ -1,7 +1,8 @@
 //! A session of the chain of decisions is logged, read and replayed, also from damaged files.
 
 use super::line::Line;
-use super::loop_log::{About, LoopLog};
+use super::logged_chain::About;
+use super::loop_log::LoopLog;
 use super::place::{FILE, OLDER_FILE, files_of};
 use super::reader::LogReader;
 use super::writer::{LogWriter, MAX_WAITING};

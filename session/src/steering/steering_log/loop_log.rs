@@ -4,13 +4,12 @@
 //! nothing in the chain of decisions, have no effect on later decisions, so most of them are left
 //! out.
 
-use super::line::{Line, Moment, Start, VERSION, View};
+use super::line::{Line, Moment, View};
+use super::logged_chain::LoggedChain;
 use super::writer::LogWriter;
-use drivers::motion::Output;
-use kinematics::{Stamp, Transform, transform};
+use kinematics::Stamp;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
-use steering::{Entry, State, Steering, Verdict};
+use steering::{BaseSteering, Steering};
 
 /// Time between two cycles without effect that are logged while the arm moves, so that its way can
 /// be shown.
@@ -18,33 +17,38 @@ const MOVING_PERIOD_SECS: f64 = 0.05;
 /// The same while the arm is at rest.
 const REST_PERIOD_SECS: f64 = 1.0;
 
-/// Content of a log besides decisions.
-#[derive(Clone, Debug)]
-pub(in crate::steering) struct About {
-    /// The robot description.
-    pub(in crate::steering) urdf: String,
-    /// Pose of the base of the arm.
-    pub(in crate::steering) world_from_base: Transform,
-}
-
 /// Logs the decisions of one loop. Dropping this value completes the log.
-pub(in crate::steering) struct LoopLog {
-    about: About,
+pub(in crate::steering) struct LoopLog<C: LoggedChain = Steering> {
+    about: C::About,
     writer: LogWriter,
     has_begun: bool,
     /// State of the chain after the last cycle.
-    before: State,
+    before: C::State,
     /// The last verdict.
-    verdict: Option<Verdict>,
+    verdict: Option<C::Verdict>,
     /// The newest cycle without effect that was left out. The time between cycles matters, so it is
     /// logged before the next entry with an effect.
-    left_out: Option<Entry>,
+    left_out: Option<C::Entry>,
     logged_at: Option<Stamp>,
     n_missing: u64,
     latest: Stamp,
 }
 
-impl LoopLog {
+impl LoopLog<BaseSteering> {
+    /// A log of a base, see [`LoopLog::new`].
+    ///
+    /// # Errors
+    ///
+    /// If no thread can be started.
+    pub(in crate::steering) fn of_base(
+        folder: &Path,
+        steering: &BaseSteering,
+    ) -> std::io::Result<Self> {
+        Self::new(folder, (), steering)
+    }
+}
+
+impl<C: LoggedChain> LoopLog<C> {
     /// A log in the folder of a run. The file is created when the log begins.
     ///
     /// # Errors
@@ -52,8 +56,8 @@ impl LoopLog {
     /// If no thread can be started.
     pub(in crate::steering) fn new(
         folder: &Path,
-        about: About,
-        steering: &Steering,
+        about: C::About,
+        steering: &C,
     ) -> std::io::Result<Self> {
         Ok(Self {
             about,
@@ -69,24 +73,26 @@ impl LoopLog {
     }
 
     /// Logs the decisions of the chain since the last call. Call it after each cycle.
-    pub(in crate::steering) fn take(&mut self, now: Stamp, steering: &mut Steering) {
+    pub(in crate::steering) fn take(&mut self, now: Stamp, steering: &mut C) {
         let (entries, n_dropped) = steering.take_record();
         self.latest = now;
         let mut lines = Vec::new();
-        if !self.has_begun && entries.iter().any(is_request) {
-            let state = std::mem::take(&mut self.before);
-            lines.push(self.start(now, steering, state));
-            self.has_begun = true;
-        }
+        let is_request = |entry: &C::Entry| C::cycle(entry).is_none();
         let state = steering.state();
+        let before = std::mem::replace(&mut self.before, state);
+        if !self.has_begun && entries.iter().any(is_request) {
+            lines.push(steering.start_line(now, &self.about, before));
+            self.has_begun = true;
+            self.add(now, entries, None, &mut lines);
+        } else if self.has_begun {
+            self.add(now, entries, Some(&before), &mut lines);
+        }
         if self.has_begun {
-            self.add(now, entries, &state, &mut lines);
             self.send(lines, n_dropped);
             if self.must_restart() {
                 self.restart(now, steering);
             }
         }
-        self.before = state;
     }
 
     /// Logs the view of an operator.
@@ -114,35 +120,45 @@ impl LoopLog {
     }
 
     /// Selects the entries to log.
-    fn add(&mut self, now: Stamp, entries: Vec<Entry>, state: &State, lines: &mut Vec<Line>) {
-        let is_without_effect = self.is_without_effect(&entries, state);
-        if let Some(Entry::Cycle { verdict, .. }) = entries.last() {
-            self.verdict = Some(verdict.clone());
+    ///
+    /// * `before`: the state before these entries; `None` if they all matter.
+    fn add(
+        &mut self,
+        now: Stamp,
+        entries: Vec<C::Entry>,
+        before: Option<&C::State>,
+        lines: &mut Vec<Line>,
+    ) {
+        let is_without_effect =
+            before.is_some_and(|before| self.is_without_effect(&entries, before));
+        if let Some(cycle) = entries.last().and_then(C::cycle) {
+            self.verdict = Some(cycle.verdict.clone());
         }
         if is_without_effect && !self.is_due(now, &entries) {
             self.left_out = entries.into_iter().next_back();
             return;
         }
         if !is_without_effect {
-            lines.extend(self.left_out.take().map(entry));
+            lines.extend(self.left_out.take().map(C::line));
         }
         self.left_out = None;
         self.logged_at = Some(now);
-        lines.extend(entries.into_iter().map(entry));
+        lines.extend(entries.into_iter().map(C::line));
     }
 
-    fn is_without_effect(&self, entries: &[Entry], state: &State) -> bool {
-        let [Entry::Cycle { verdict, .. }] = entries else {
+    fn is_without_effect(&self, entries: &[C::Entry], before: &C::State) -> bool {
+        let [entry] = entries else {
             return false;
         };
-        verdict.output == Output::Brake
-            && self.verdict.as_ref() == Some(verdict)
-            && state.is_equal_except_times(&self.before)
+        C::cycle(entry).is_some_and(|cycle| {
+            cycle.is_braking
+                && self.verdict.as_ref() == Some(cycle.verdict)
+                && C::are_equal_except_times(&self.before, before)
+        })
     }
 
-    fn is_due(&self, now: Stamp, entries: &[Entry]) -> bool {
-        let is_at_rest =
-            |entry: &Entry| matches!(entry, Entry::Cycle { arm, .. } if arm.is_at_rest);
+    fn is_due(&self, now: Stamp, entries: &[C::Entry]) -> bool {
+        let is_at_rest = |entry: &C::Entry| C::cycle(entry).is_some_and(|cycle| cycle.is_at_rest);
         let period_secs = if entries.iter().all(is_at_rest) {
             REST_PERIOD_SECS
         } else {
@@ -164,12 +180,12 @@ impl LoopLog {
     }
 
     /// Logs the state of the chain, from which the rest of the log can be replayed alone.
-    fn restart(&mut self, now: Stamp, steering: &Steering) {
+    fn restart(&mut self, now: Stamp, steering: &C) {
         let mut lines = Vec::new();
         if self.n_missing > 0 {
             lines.push(Line::Missing(self.n_missing));
         }
-        lines.push(self.start(now, steering, steering.state()));
+        lines.push(steering.start_line(now, &self.about, steering.state()));
         if self.writer.send(lines) {
             self.n_missing = 0;
             self.left_out = None;
@@ -178,45 +194,14 @@ impl LoopLog {
             self.n_missing = self.n_missing.max(1);
         }
     }
-
-    fn start(&self, at: Stamp, steering: &Steering, state: State) -> Line {
-        Line::Start(Box::new(Start {
-            version: VERSION,
-            program: format!(
-                "fieldrig {} {}",
-                env!("CARGO_PKG_VERSION"),
-                std::env::consts::ARCH
-            ),
-            at,
-            unix_millis: unix_millis(),
-            world_from_base: transform::to_xyz_xyzw(&self.about.world_from_base),
-            setup: steering.setup(self.about.urdf.clone()).with_state(state),
-        }))
-    }
 }
 
-impl Drop for LoopLog {
+impl<C: LoggedChain> Drop for LoopLog<C> {
     fn drop(&mut self) {
         if self.has_begun {
-            let mut lines: Vec<Line> = self.left_out.take().map(entry).into_iter().collect();
+            let mut lines: Vec<Line> = self.left_out.take().map(C::line).into_iter().collect();
             lines.push(Line::End(Moment { at: self.latest }));
             self.send(lines, 0);
         }
     }
-}
-
-fn entry(entry: Entry) -> Line {
-    Line::Entry(Box::new(entry))
-}
-
-fn is_request(entry: &Entry) -> bool {
-    matches!(entry, Entry::Request { .. })
-}
-
-fn unix_millis() -> u64 {
-    #[expect(clippy::disallowed_methods, reason = "only shown; no time is measured")]
-    let since_epoch = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
 }

@@ -25,9 +25,10 @@ pub(super) struct LogReader {
     other_version: Option<u64>,
 }
 
-/// A start of any version.
+/// A start of any version, of an arm or of a base.
 #[derive(Deserialize)]
 struct AnyStart {
+    #[serde(alias = "base_start")]
     start: AnyVersion,
 }
 
@@ -122,7 +123,10 @@ impl LogReader {
 
     /// Whether a line is a start of another version, which may have other fields.
     fn is_foreign(&mut self, line: &[u8]) -> bool {
-        let start = line.starts_with(b"{\"start\"").then_some(line);
+        let is_start = [&b"{\"start\""[..], b"{\"base_start\""]
+            .iter()
+            .any(|start| line.starts_with(start));
+        let start = is_start.then_some(line);
         let version = start.and_then(|line| serde_json::from_slice(line).ok());
         let version = version.map(|any: AnyStart| any.start.version);
         self.other_version = version.filter(|version| *version != VERSION);
@@ -139,7 +143,10 @@ impl LogReader {
             ))
             .into());
         }
-        let is_log = matches!(self.lines.front(), Some(Line::Start(_)));
+        let is_log = matches!(
+            self.lines.front(),
+            Some(Line::Start(_) | Line::BaseStart(_))
+        );
         if std::mem::replace(&mut self.is_first, false) && !is_log {
             let why = match &self.damage {
                 Some(damage) => damage.as_str(),

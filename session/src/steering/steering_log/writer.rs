@@ -171,7 +171,8 @@ impl Files {
 
     fn write(&mut self, line: &Line) -> std::io::Result<()> {
         let is_full = self.current.as_ref().is_none_or(|file| file.is_full);
-        if is_full && matches!(line, Line::Start(_)) {
+        let is_start = matches!(line, Line::Start(_) | Line::BaseStart(_));
+        if is_full && is_start {
             self.begin()?;
         }
         let Some(file) = &mut self.current else {

@@ -19,6 +19,8 @@ export interface Incident {
   target: number[] | null;
   /** What the operator saw. */
   view: PoseNumbers | null;
+  /** Pose of the base, if it was steered. */
+  worldFromBase: PoseNumbers | null;
 }
 
 /** Where the arm was at a time. */
@@ -26,6 +28,8 @@ export interface Sample {
   seconds: number;
   position: number[];
   target: number[] | null;
+  /** Pose of the base, if it was steered. */
+  worldFromBase: PoseNumbers | null;
 }
 
 export interface IncidentList {
@@ -90,7 +94,8 @@ function incidentIn(value: unknown, nJoints: number): Incident | null {
     operator: isNumber(value.operator) ? value.operator : null,
     position,
     target: areNumbers(target, nJoints) ? target : null,
-    view: areNumbers(value.view, 7) ? (value.view as PoseNumbers) : null,
+    view: poseOr(value.view),
+    worldFromBase: poseOr(value.world_from_base),
   };
 }
 
@@ -98,7 +103,12 @@ function sampleIn(value: unknown, nJoints: number): Sample | null {
   if (!isFields(value)) return null;
   const { seconds, position, target } = value;
   if (!isNumber(seconds) || !areNumbers(position, nJoints)) return null;
-  return { seconds, position, target: areNumbers(target, nJoints) ? target : null };
+  const worldFromBase = poseOr(value.world_from_base);
+  return { seconds, position, target: areNumbers(target, nJoints) ? target : null, worldFromBase };
+}
+
+function poseOr(value: unknown): PoseNumbers | null {
+  return areNumbers(value, 7) ? (value as PoseNumbers) : null;
 }
 
 /** The track around an incident, and the index of the sample that is closest to it. */

@@ -116,7 +116,7 @@ export class Incidents {
   private showSample(): void {
     const sample = this.samples[this.slider.valueAsNumber];
     if (!this.found || !this.chosen || !sample) return;
-    this.pose(this.found, { ...this.chosen, position: sample.position, target: sample.target });
+    this.pose(this.found, { ...this.chosen, ...sample });
     setText(this.chosenText, `${timeText(sample.seconds)}, ${modelText(this.found, { ...this.chosen, seconds: sample.seconds })}`);
   }
 
@@ -127,10 +127,10 @@ export class Incidents {
   }
 
   /** Shows the robot and its target; returns whether the robot is known. */
-  private pose(found: IncidentList, { kind, position, target }: Incident): boolean {
+  private pose(found: IncidentList, { kind, position, target, worldFromBase: ofBase }: Incident): boolean {
     const { robot } = this.view;
-    const worldFromBase = matrixOf(found.worldFromBase);
-    if (!robot.description || position.length === 0) {
+    const worldFromBase = matrixOf(ofBase ?? found.worldFromBase);
+    if (!robot.description || (position.length === 0 && !ofBase)) {
       this.ghost.hide();
       return false;
     }

@@ -2,12 +2,14 @@
 // the arm. In preview mode, the same inputs move a goal, and only "go" moves the arm, while it is held. This file has no DOM.
 
 import { DeadMan, type Source } from "./dead_man";
+import { goalIntent, isInArea } from "./floor_goal";
 import { Goal } from "./goal";
 import { HandTimes } from "./hand_times";
 import { ModeChoice, type Mode, RoundTrips } from "./round_trip";
 import {
   type Axes,
   axesOf,
+  baseIntent,
   type Deflection,
   type FrameName,
   type FrameRotations,
@@ -19,7 +21,7 @@ import {
 } from "./jog";
 import type { PadInput } from "./gamepad";
 import { LeaseKeeper } from "./lease_keeper";
-import type { Arm, Intent, SteerMessage, SteerRequest, SteerState } from "./messages";
+import type { Arm, Intent, Point, SteerMessage, SteerRequest, SteerState } from "./messages";
 import { type HandSpeed, integrated, numbersOf, type Pose, poseOf, slewed } from "./pose";
 import { capitalized } from "../panels/sentence";
 
@@ -31,7 +33,7 @@ const PING_MILLIS = 250;
 /** Without a message for this time, the link is regarded as cut. The server answers four pings a second. */
 const SILENT_MILLIS = 1000;
 /** Why the switch is open after the operator's own stop. */
-const OWN_STOP = "you stopped the arm";
+const OWN_STOP = "you stopped the robot";
 
 /** What one of the jog inputs asks for. */
 export type Jog = { kind: "tip"; deflection: Deflection } | { kind: "joint"; ix: number; direction: number };
@@ -77,6 +79,10 @@ export class Commander {
   /** The hand of the gizmo: where it is, and where the pointer wants it. */
   private hand: { now: Pose; wanted: Pose } | null = null;
   private goIntent: Intent | null = null;
+  /** Where a base should go: x, y and heading in the world. */
+  private floorGoal: Point | null = null;
+  /** Whether the base has been at this goal. */
+  private hasArrived = false;
   /** Whether the triggers of the gamepad were seen open since the page has paid attention to it. */
   private isPadReady = false;
   /** Whether the gamepad's button for a stop is down. */
@@ -118,7 +124,19 @@ export class Commander {
   }
 
   get mode(): Mode {
+    // A velocity of a base needs no preview: over a slow link, the base brakes as soon as commands are late.
+    if (this.arm?.base) return "servo";
     return this.previewsAlways ? "preview" : this.chosen;
+  }
+
+  /** The goal of a base; null if there is none. */
+  get baseGoal(): Point | null {
+    return this.floorGoal;
+  }
+
+  /** Whether a base may be sent to its goal. */
+  get mayGoToBaseGoal(): boolean {
+    return this.floorGoal !== null && isInArea(this.floorGoal, this.arm?.base?.area_m ?? null);
   }
 
   /** Median time from the hand to the joints over the last commands of this page, milliseconds; null if there are none. */
@@ -128,6 +146,7 @@ export class Commander {
 
   /** Where the gizmo is: at the hand, at the goal, or at the tip of the arm. In the base; null without an arm. */
   get gizmo(): Pose | null {
+    if (this.arm?.base) return null;
     if (this.hand && this.deadMan.source === "gizmo") return this.hand.now;
     return this.goalTip() ?? (this.state && poseOf(this.state.base_from_tip));
   }
@@ -154,6 +173,7 @@ export class Commander {
     this.state = null;
     this.roundTrips.restart();
     this.goal.clear();
+    this.floorGoal = null;
     this.permit("the link to the arm is cut");
   }
 
@@ -189,6 +209,7 @@ export class Commander {
     this.permit(state.stop ?? "control of the arm has ended");
     if (hadControl && !this.hasControl) {
       this.goal.clear();
+      this.floorGoal = null;
       this.nudge = null;
     }
     this.times.add(state);
@@ -196,6 +217,9 @@ export class Commander {
       this.goIntent = null;
       this.goal.clear();
     }
+    // After the release, a goal that was reached is done.
+    if (state.base?.has_arrived) this.hasArrived = true;
+    else if (this.hasArrived && this.deadMan.source === null) this.setBaseGoal(null);
   }
 
   private permit(reason: string): void {
@@ -271,6 +295,13 @@ export class Commander {
     if (this.maySteer) this.setGoal({ kind: "joints", position: [...position] });
   }
 
+  /** Sets where the base should go; null for nowhere. */
+  setBaseGoal(goal: Point | null): void {
+    if (this.deadMan.source === "go" || this.deadMan.source === "pad go") this.deadMan.open("the goal has changed");
+    this.floorGoal = goal;
+    this.hasArrived = false;
+  }
+
   private setGoal(target: Parameters<Goal["set"]>[0]): void {
     if (this.deadMan.source === "go" || this.deadMan.source === "pad go") this.deadMan.open("the goal has changed");
     this.goIntent = null;
@@ -285,8 +316,12 @@ export class Commander {
     }
     const before = this.goIntent;
     // The press sends the first sample of the grip, which must have the intent.
-    this.goIntent = this.goal.intent;
+    this.goIntent = this.arm?.base ? this.baseGoalIntent() : this.goal.intent;
     if (!this.deadMan.press(source, this.goIntent !== null)) this.goIntent = before;
+  }
+
+  private baseGoalIntent(): Intent | null {
+    return this.floorGoal && this.mayGoToBaseGoal ? goalIntent(this.floorGoal) : null;
   }
 
   /** Sets what a source of jogging asks for; null if it is released. */
@@ -302,7 +337,7 @@ export class Commander {
     if (!isNew) return;
     const isPreview = this.mode === "preview";
     const axes = this.axesNow();
-    const hasAxes = jog.kind === "joint" || axes !== null;
+    const hasAxes = jog.kind === "joint" || axes !== null || this.arm?.base != null;
     if (!hasAxes) this.events.notice("The pose of the robot in the view is not known yet: choose the frame of the tool or the base");
     this.deadMan.press(source, hasAxes && !isPreview);
     if (isPreview && hasAxes && this.maySteer && !this.nudge) this.nudge = { source, axes };
@@ -433,6 +468,7 @@ export class Commander {
     const jog = source && this.jogs.get(source);
     const { arm } = this;
     if (!jog || !arm) return null;
+    if (arm.base) return jog.kind === "tip" ? baseIntent(arm.base, jog.deflection, this.speed) : null;
     if (jog.kind === "joint") {
       return { kind: "joint_velocity", velocity: jointVelocities(arm.joints, jog.ix, jog.direction, this.speed) };
     }

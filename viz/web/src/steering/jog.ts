@@ -2,7 +2,7 @@
 // base. This file has no DOM.
 
 import { Matrix4, Quaternion, Vector3 } from "three";
-import type { ArmJoint, Intent } from "./messages";
+import type { ArmJoint, Intent, SteeredBase } from "./messages";
 
 export type FrameName = "view" | "tool" | "base";
 
@@ -81,6 +81,18 @@ export interface TipVelocity {
 
 export function tipIntent({ linear, angular }: TipVelocity): Intent {
   return { kind: "tip_velocity", linear_m_s: linear.toArray(), angular_rad_s: angular.toArray() };
+}
+
+/** Velocity of a base. One that cannot move sideways turns instead. `speed` is 0 to 1. */
+export function baseIntent(base: SteeredBase, { forward, right, yaw }: Deflection, speed: number): Intent {
+  const canStrafe = base.max_left_m_s > 0;
+  const turn = Math.min(1, Math.max(-1, canStrafe ? yaw : yaw - right));
+  return {
+    kind: "base_velocity",
+    forward_m_s: forward * speed * base.max_forward_m_s,
+    left_m_s: canStrafe ? 0 - right * speed * base.max_left_m_s : 0,
+    yaw_rad_s: turn * speed * base.max_yaw_rad_s,
+  };
 }
 
 /** Velocities of the joints if one of them is jogged. */

@@ -8,6 +8,9 @@ import type { ArmJoint } from "./messages";
 import { type Deflection, NO_DEFLECTION } from "./jog";
 import { jointText } from "./texts";
 
+/** Directions that a base has, too. */
+const ON_FLOOR: readonly (keyof Deflection)[] = ["right", "forward", "yaw"];
+
 /** Pairs of directions: the names of both, and the deflection of the first. */
 const PAIRS: readonly [minus: string, plus: string, axis: keyof Deflection][] = [
   ["Left", "Right", "right"],
@@ -32,7 +35,9 @@ export class JogPad {
     const tip = element("steer-tip");
     for (const [minus, plus, axis] of PAIRS) {
       const jog = (value: number): Jog => ({ kind: "tip", deflection: { ...NO_DEFLECTION, [axis]: value } });
-      tip.append(this.button(minus, minus, jog(-1)), this.button(plus, plus, jog(1)));
+      const buttons = [this.button(minus, minus, jog(-1)), this.button(plus, plus, jog(1))];
+      for (const button of buttons) button.classList.toggle("of-arm", !ON_FLOOR.includes(axis));
+      tip.append(...buttons);
     }
   }
 

@@ -30,7 +30,7 @@ export class LeasePanel {
   show(): void {
     const { arm, state, isOpen, hasControl } = this.commander;
     const isKnown = isOpen && arm !== null && state !== null;
-    setText(element("steer-lease"), isKnown ? leaseText(state, arm.client) : "No link to the arm");
+    setText(element("steer-lease"), isKnown ? leaseText(state, arm.client, arm.base ? "base" : "arm") : "No link to the robot");
     element("toggle-steer").dataset.control = hasControl ? "own" : typeof state?.holder === "number" ? "other" : "nobody";
     this.take.hidden = hasControl;
     disable(this.take, this.reasonAgainstTaking());

@@ -5,13 +5,15 @@
 export type PoseNumbers = [number, number, number, number, number, number, number];
 export type Point = [number, number, number];
 
-/** Where the arm should move. */
+/** Where the arm or the base should move. */
 export type Intent =
   | { kind: "hand"; base_from_hand: PoseNumbers }
   | { kind: "pose"; base_from_tip: PoseNumbers }
   | { kind: "joints"; position: number[] }
   | { kind: "joint_velocity"; velocity: number[] }
-  | { kind: "tip_velocity"; linear_m_s: Point; angular_rad_s: Point };
+  | { kind: "tip_velocity"; linear_m_s: Point; angular_rad_s: Point }
+  | { kind: "base_velocity"; forward_m_s: number; left_m_s: number; yaw_rad_s: number }
+  | { kind: "base_goal"; x_m: number; y_m: number; heading_rad: number };
 
 /** A pose of the tip, or positions of the joints. */
 export type PreviewTarget = { base_from_tip: PoseNumbers } | { position: number[] };
@@ -44,7 +46,19 @@ export interface ArmJoint {
   velocity: number;
 }
 
-/** First message: the arm, and what this client may do. */
+/** A base that is driven. */
+export interface SteeredBase {
+  /** Largest speeds, m/s and rad/s. Sideways, it is 0 for a base that cannot move there. */
+  max_forward_m_s: number;
+  max_left_m_s: number;
+  max_yaw_rad_s: number;
+  /** Where it stays: smallest x and y, then largest x and y, in the world, meters. */
+  area_m: Area | null;
+}
+
+export type Area = [number, number, number, number];
+
+/** First message: the arm or the base, and what this client may do. */
 export interface Arm {
   type: "arm";
   client: number;
@@ -57,6 +71,8 @@ export interface Arm {
   lease_secs: number;
   /** Greatest round-trip time at which the arm follows the hand. */
   servo_round_trip_millis: number;
+  /** The base, if it is steered instead of an arm. */
+  base: SteeredBase | null;
 }
 
 /** A limit that was applied. */
@@ -83,6 +99,13 @@ export interface SteerClient {
   role: string;
 }
 
+/** State of a base. Places are x and y in meters and the heading in radians, in the world. */
+export interface BaseState {
+  world_from_base: Point | null;
+  goal: Point | null;
+  has_arrived: boolean;
+}
+
 export interface SteerState {
   type: "state";
   time_micros: number;
@@ -105,6 +128,8 @@ export interface SteerState {
   applied: Applied | null;
   /** Contacts of the robot with a simulated scene. */
   contacts: number | null;
+  /** The base, if it is steered instead of an arm. */
+  base: BaseState | null;
   clients: SteerClient[];
 }
 
@@ -169,9 +194,23 @@ function armIn({ client, may_steer, base_link, tip_link, joints, expiry_secs, le
   if (!isNumber(client) || !isText(base_link) || !isText(tip_link) || !Array.isArray(joints)) return null;
   if (!isNumber(expiry_secs) || !isNumber(lease_secs) || !isNumber(servo_round_trip_millis)) return null;
   const read = joints.map(jointIn).filter((joint) => joint !== null);
-  if (read.length !== joints.length || read.length === 0) return null;
+  const base = baseIn(fields.base);
+  if (read.length !== joints.length || (read.length === 0 && !base)) return null;
   const common = { base_link, tip_link, expiry_secs, lease_secs, servo_round_trip_millis };
-  return { type: "arm", client, may_steer: may_steer === true, joints: read, ...common };
+  return { type: "arm", client, may_steer: may_steer === true, joints: read, base, ...common };
+}
+
+function baseIn(value: unknown): SteeredBase | null {
+  if (!isFields(value)) return null;
+  const { max_forward_m_s, max_left_m_s, max_yaw_rad_s, area_m } = value;
+  if (!isNumber(max_forward_m_s) || !isNumber(max_left_m_s) || !isNumber(max_yaw_rad_s)) return null;
+  const area = areNumbers(area_m) && area_m.length === 4 ? (area_m as Area) : null;
+  return { max_forward_m_s, max_left_m_s, max_yaw_rad_s, area_m: area };
+}
+
+function baseStateIn(value: unknown): BaseState | null {
+  if (!isFields(value)) return null;
+  return { world_from_base: pointOr(value.world_from_base), goal: pointOr(value.goal), has_arrived: value.has_arrived === true };
 }
 
 function jointIn(value: unknown): ArmJoint | null {
@@ -200,6 +239,7 @@ function stateIn(fields: Fields): SteerState | null {
     limits: listOf(fields.limits, limitIn),
     applied: appliedIn(fields.applied),
     contacts: numberOr(fields.contacts),
+    base: baseStateIn(fields.base),
     clients: listOf(fields.clients, clientIn),
   };
 }

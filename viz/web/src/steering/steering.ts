@@ -11,6 +11,7 @@ import type { action, toggle } from "../keys";
 import { worldFromCamera } from "../view/convention";
 import type { OrbitView } from "../view/orbit_view";
 import { Commander } from "./commander";
+import { FloorGoalTool } from "./floor_goal_tool";
 import { firstPad } from "./gamepad";
 import { Ghost, type GhostParts } from "./ghost";
 import { isApart, lookOfLimits, lookOfVerdict, LOOKS } from "./ghost_looks";
@@ -22,12 +23,12 @@ import { JogPad } from "./jog_pad";
 import { LeasePanel } from "./lease_panel";
 import { LimitsList } from "./limits_list";
 import { Marks } from "./marks";
-import type { SteerMessage, SteerRequest } from "./messages";
+import type { Point, SteerMessage, SteerRequest } from "./messages";
 import { numbersOf, type Pose, poseOf, poseOfMatrix } from "./pose";
 import { PoseList } from "./pose_list";
 import { SteerSocket } from "./steer_socket";
 import { StopButton } from "./stop_button";
-import { modeText, verdictText } from "./texts";
+import { baseGoalText, baseText, modeText, verdictText } from "./texts";
 
 // One script for both, because they draw the same ghost.
 export { Incidents } from "../incidents/incidents";
@@ -38,6 +39,8 @@ const TICK_MILLIS = 20;
 const VIEW_MILLIS = 200;
 /** Period at which the panel is updated. */
 const SHOW_MILLIS = 100;
+/** Places in the world. */
+const ORIGIN: Pose = { position: new THREE.Vector3(), rotation: new THREE.Quaternion() };
 
 /** What the script uses of the page, whose modules it cannot import as far as they have a state. */
 export interface PageParts extends GhostParts {
@@ -51,6 +54,7 @@ export class Steering {
   private readonly socket: SteerSocket;
   private readonly ghost: Ghost;
   private readonly gizmo: Gizmo;
+  private readonly floorGoal: FloorGoalTool;
   private readonly camera: THREE.PerspectiveCamera;
   private readonly stopButton: StopButton;
   private readonly lease: LeasePanel;
@@ -92,6 +96,13 @@ export class Steering {
       return new Gizmo(ofView, canvas, this.gizmoEvents(), changed);
     });
     this.camera = camera!;
+    this.floorGoal = view.addTool((ofView) => {
+      const chosen = (goal: Point): void => {
+        this.commander.setBaseGoal(goal);
+        this.draw();
+      };
+      return new FloorGoalTool(ofView, canvas, chosen, () => this.choosePlace(false), changed);
+    });
     const marks = view.addTool((ofView) => new Marks(ofView, canvas, changed));
     view.addTool(() => ({ root: this.ghost.root, hasTakenPress: false, update: () => undefined }));
     const send = (request: SteerRequest): void => this.send(request);
@@ -146,9 +157,11 @@ export class Steering {
       this.show();
     });
     holdButton(element("steer-go"), (isHeld) => commander.setGo(isHeld));
+    element("steer-place").addEventListener("click", () => this.choosePlace(!this.floorGoal.isChoosing));
     element("steer-discard").addEventListener("click", () => {
       commander.interrupt("the goal was discarded");
       commander.goal.clear();
+      commander.setBaseGoal(null);
       this.show();
     });
     for (const kind of ["pointerdown", "keydown"] as const) {
@@ -182,9 +195,19 @@ export class Steering {
 
   private receive(message: SteerMessage): void {
     this.commander.receive(message, performance.now());
-    if (message.type === "arm") this.notice("");
+    if (message.type === "arm") {
+      this.notice("");
+      element("steer").dataset.robot = message.base ? "base" : "arm";
+    }
     if (message.type === "state" || message.type === "preview") this.draw();
     if (message.type === "state" || message.type === "arm") this.stopButton.show();
+  }
+
+  /** Lets the next press on the view choose the goal of the base, or not. */
+  private choosePlace(isChoosing: boolean): void {
+    this.floorGoal.isChoosing = isChoosing;
+    element("steer-place").ariaPressed = String(isChoosing);
+    this.show();
   }
 
   private closed(): void {
@@ -269,9 +292,21 @@ export class Steering {
   }
 
   private draw(): void {
+    if (this.commander.arm?.base) {
+      this.drawFloorGoal();
+      // Places of a base are in the world.
+      this.limits.show(ORIGIN);
+      return;
+    }
     this.placeGizmo();
     this.drawGhost();
     this.limits.show(this.worldFromBase);
+  }
+
+  private drawFloorGoal(): void {
+    const { baseGoal, state } = this.commander;
+    const heading = state?.base?.world_from_base?.[2] ?? 0;
+    this.floorGoal.show(baseGoal ?? state?.base?.goal ?? null, { z: this.worldFromBase?.position.z ?? 0, heading });
   }
 
   private placeGizmo(): void {
@@ -314,13 +349,15 @@ export class Steering {
     this.jogKeys.show();
     if (!element("steer").hidden) this.jogPad.show();
     this.showMode();
-    this.showGoal();
+    if (this.commander.arm?.base) this.showBaseGoal();
+    else this.showGoal();
     this.showTime();
     const contacts = commander.state?.contacts ?? 0;
     setText(element("steer-contacts"), contacts > 0 ? `The robot has touched the scene ${contacts} times` : "");
     if (!commander.state) {
       this.gizmo.place(null);
       this.ghost.hide();
+      this.floorGoal.show(null, { z: 0, heading: 0 });
       this.limits.show(null);
     } else if (commander.maySteer && commander.deadMan.source === null) {
       this.draw(); // The view and the chosen axes change without a message.
@@ -330,7 +367,8 @@ export class Steering {
   private showMode(): void {
     const { arm, mode, roundTrips, previewsAlways, hasControl } = this.commander;
     const millis = roundTrips.millis(performance.now());
-    const text = arm ? modeText(mode, millis, arm.servo_round_trip_millis, previewsAlways) : "";
+    const ofArm = arm ? modeText(mode, millis, arm.servo_round_trip_millis, previewsAlways) : "";
+    const text = arm?.base ? baseText(millis) : ofArm;
     setText(element("steer-mode"), text);
     element("steer-mode").dataset.mode = mode;
     if (hasControl && mode !== this.shownMode) announce(text.split(" (")[0]!);
@@ -349,6 +387,15 @@ export class Steering {
     const isHeld = this.commander.deadMan.source === "go";
     const reason = goal.intent || isHeld ? "" : "The goal cannot be reached, or is still being checked";
     disable(element("steer-go", HTMLButtonElement), reason);
+  }
+
+  private showBaseGoal(): void {
+    const { baseGoal, mayGoToBaseGoal, state, deadMan, maySteer } = this.commander;
+    element("steer-goal").hidden = baseGoal === null;
+    const text = baseGoalText(state?.base?.has_arrived === true, mayGoToBaseGoal);
+    setText(element("steer-verdict"), baseGoal ? text : "");
+    disable(element("steer-go", HTMLButtonElement), mayGoToBaseGoal || deadMan.source === "go" ? "" : text);
+    if (!maySteer && this.floorGoal.isChoosing) this.choosePlace(false);
   }
 
   private showTime(): void {

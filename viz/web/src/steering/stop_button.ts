@@ -45,7 +45,7 @@ export class StopButton {
     const isOwn = state?.holder === arm?.client;
     setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
     this.showStop(state ? stopText(state) : "");
-    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : "Arm stopped");
+    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : state?.base ? "Base stopped" : "Arm stopped");
     this.shownStop = state?.stop_number ?? null;
     const reason = state?.is_recovering ? "The arm is being recovered: wait" : "";
     disable(this.rearm, hasControl ? reason : "Only the operator who has control can permit motion");

@@ -3,9 +3,9 @@
 import type { Limit, SteerState, Verdict } from "./messages";
 import type { Mode } from "./round_trip";
 
-/** Who has control, from the view of one client. */
-export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number): string {
-  if (holder === null) return "Nobody has control of the arm";
+/** Who has control, from the view of one client. `robot` is what is steered. */
+export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number, robot = "arm"): string {
+  if (holder === null) return `Nobody has control of the ${robot}`;
   if (holder === client) {
     return offered_to === null ? "You have control" : `You have control, offered to operator ${offered_to}`;
   }
@@ -16,8 +16,8 @@ export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, c
 }
 
 /** Why the arm is stopped, and that it is being recovered; empty if neither is so. */
-export function stopText({ stop, is_recovering }: SteerState): string {
-  const reason = stop === null ? "" : `The arm is stopped: ${stop}`;
+export function stopText({ stop, is_recovering, base }: SteerState): string {
+  const reason = stop === null ? "" : `The ${base ? "base" : "arm"} is stopped: ${stop}`;
   if (!is_recovering) return reason;
   return `The arm is being recovered. Motion is permitted afterward, unless somebody stops it. ${reason}`.trimEnd();
 }
@@ -28,6 +28,18 @@ export function modeText(mode: Mode, roundTripMillis: number | null, thresholdMi
   const measured = roundTripMillis === null ? `link not measured yet, ${limit}` : `${Math.round(roundTripMillis)} ms, ${limit}`;
   if (mode === "servo") return `Servo: the arm follows while you hold (${measured})`;
   return `Preview, then go${isForced ? " as chosen" : ""}: you move the ghost, then hold Go (${measured})`;
+}
+
+/** How a base is driven, and whether it may be sent to a goal. */
+export function baseText(roundTripMillis: number | null): string {
+  const measured = roundTripMillis === null ? "link not measured yet" : `${Math.round(roundTripMillis)} ms`;
+  return `The base moves while you hold (${measured})`;
+}
+
+/** What a goal of a base needs. */
+export function baseGoalText(hasArrived: boolean, mayGo: boolean): string {
+  if (!mayGo) return "The goal is outside the area of the base";
+  return hasArrived ? "The base is at the goal" : "Hold Go until the base is there";
 }
 
 /** A limit in one sentence. */

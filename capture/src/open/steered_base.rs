@@ -1,0 +1,297 @@
+//! Opens the devices of a rig with a base that operators drive.
+
+use super::real;
+use super::robot_tap::RobotTap;
+use super::{Devices, Opened, check_arm, is_any_simulated};
+use crate::config::{
+    ArmDriver, BaseDriver, BaseMotion, Camera, CameraDriver, Rig, Scanner, ScannerDriver,
+};
+use crate::stamp_clock::StampClock;
+use anyhow::bail;
+use drivers::Source;
+use drivers::base_motion::{BaseDrive, BasePort};
+use drivers::udp::UdpDrivenBase;
+use drivers::{BasePose, LiveDevices, clock};
+use kinematics::JointState;
+use messages::{BadInput, Setting};
+
+/// A base that operators drive. Dropping it lets the base brake.
+#[derive(Debug)]
+pub struct SteeredBase {
+    drive: BaseDrive,
+    tap: RobotTap,
+    #[cfg(feature = "sim")]
+    simulated: Option<sim::SteeredBase>,
+}
+
+impl SteeredBase {
+    /// A base that stands still until it is driven.
+    fn standing(drive: BaseDrive, tap: RobotTap) -> Self {
+        Self {
+            drive,
+            tap,
+            #[cfg(feature = "sim")]
+            simulated: None,
+        }
+    }
+
+    /// Targets and states of the base.
+    #[must_use]
+    pub fn port(&self) -> &BasePort {
+        self.drive.port()
+    }
+
+    /// The newest pose that the base or its localization has reported, without the corrections of
+    /// stations; `None` if it comes from the images of the run. It does not wait for the input of the
+    /// run.
+    #[must_use]
+    pub fn reported_pose(&self) -> Option<BasePose> {
+        #[cfg(feature = "sim")]
+        if let Some(base) = &self.simulated {
+            let stamp = clock::now();
+            return Some(BasePose {
+                stamp,
+                world_from_base: base.world_from_base(stamp),
+            });
+        }
+        self.tap.pose()
+    }
+
+    /// The newest joint state of the arm on the base, without `arm.joint_offsets`; `None` without an
+    /// arm. It does not wait for the input of the run.
+    #[must_use]
+    pub fn reported_joints(&self) -> Option<JointState> {
+        self.tap.joints()
+    }
+
+    /// Takes the base over, or stops it. A simulated base brakes and ends its tour; a real base stands
+    /// still anyway.
+    pub fn begin(&self) {
+        #[cfg(feature = "sim")]
+        if let Some(base) = &self.simulated {
+            base.begin();
+        }
+    }
+
+    /// How often a part of the robot has touched the scene; `None` if it is not counted, as for real
+    /// robots.
+    #[must_use]
+    pub fn n_contacts(&self) -> Option<u64> {
+        #[cfg(feature = "sim")]
+        return self.simulated.as_ref()?.n_contacts();
+        #[cfg(not(feature = "sim"))]
+        None
+    }
+}
+
+/// Whether operators drive the base of a rig, instead of its arm.
+#[must_use]
+pub fn is_base_steered(rig: &Rig, devices: Devices) -> bool {
+    match devices {
+        Devices::Sim => super::base_moves(rig),
+        Devices::Real => rig.has_moving_base(),
+    }
+}
+
+/// Opens the devices of a rig, see [`super::rig`], with a base that operators drive.
+///
+/// # Errors
+///
+/// For the reasons of [`super::rig`] and [`check_drivable`], or if the base cannot be driven.
+pub fn with_steered_base(rig: Rig, devices: Devices) -> anyhow::Result<(Opened, SteeredBase)> {
+    check_drivable(&rig, devices)?;
+    super::open_rig_with(rig, devices, open_devices)
+}
+
+/// Opens the devices of a rig whose settings are checked.
+fn open_devices(
+    rig: &mut Rig,
+    _arm_driver: ArmDriver,
+) -> anyhow::Result<(Box<dyn Source>, StampClock, SteeredBase)> {
+    let motion = rig.base.motion.clone().unwrap_or_default();
+    if rig.base.driver == BaseDriver::Sim {
+        let (source, base) = open_simulated(rig, &motion)?;
+        return Ok((source, StampClock::Computer, base));
+    }
+    let (mut devices, _) = real::open(rig, &mut real::end_on_failure)
+        .map_err(|error| super::with_sim_hint(error, rig))?;
+    let tap = RobotTap::default();
+    devices.base = devices.base.map(|base| tap.of_base(base));
+    devices.arm = devices.arm.map(|arm| tap.of_arm(arm));
+    // The base is reached last, so that it is driven only if everything else works.
+    let base = open_real(&motion, tap)?;
+    let source = Box::new(LiveDevices::new(devices)?);
+    Ok((source, StampClock::Computer, base))
+}
+
+fn open_real(motion: &BaseMotion, tap: RobotTap) -> anyhow::Result<SteeredBase> {
+    let Some(address) = motion.address else {
+        bail!("base.motion.address is missing: this is a bug");
+    };
+    // Two starts never have the same time.
+    let session = clock::now().0.unsigned_abs();
+    let base = UdpDrivenBase::open(address, session)?;
+    log::info!("base: driving the controller at {address}");
+    if !address.ip().is_loopback() {
+        log::warn!(
+            "base: any program in the network can drive the controller at {address}, because datagrams are not authenticated"
+        );
+    }
+    let drive = BaseDrive::start(Box::new(base), motion.limits())?;
+    Ok(SteeredBase::standing(drive, tap))
+}
+
+#[cfg(feature = "sim")]
+fn open_simulated(
+    rig: &Rig,
+    motion: &BaseMotion,
+) -> anyhow::Result<(Box<dyn Source>, SteeredBase)> {
+    let (source, base, driven) = super::simulated::with_steered_base(rig)?;
+    let base = SteeredBase {
+        drive: BaseDrive::start(driven, motion.limits())?,
+        tap: RobotTap::default(),
+        simulated: Some(base),
+    };
+    Ok((source, base))
+}
+
+#[cfg(not(feature = "sim"))]
+fn open_simulated(
+    _rig: &Rig,
+    _motion: &BaseMotion,
+) -> anyhow::Result<(Box<dyn Source>, SteeredBase)> {
+    bail!(
+        "this program was built without the simulator: build it with `cargo build --release --features sim`"
+    )
+}
+
+/// Why a rig with real and simulated devices is refused.
+const MIXED: &str = "the base and all other devices must be real, or all must be simulated, so that \
+                     the images show the motion";
+
+/// Whether any device of a rig is real.
+fn is_any_real(rig: &Rig) -> bool {
+    let is_arm_real = !matches!(rig.arm.driver, ArmDriver::Sim | ArmDriver::None);
+    let is_real = |camera: &Camera| camera.driver != CameraDriver::Sim;
+    let scans = |scanner: &Scanner| scanner.driver != ScannerDriver::Sim;
+    is_arm_real || rig.cameras.iter().any(is_real) || rig.scanners.iter().any(scans)
+}
+
+/// Checks that operators may drive the base of a rig, as far as possible without devices.
+///
+/// # Errors
+///
+/// If the base cannot be driven, the posture in which its arm is stowed is not known, a simulated
+/// base has an arm, or a simulation waits for the trainer.
+pub fn check_drivable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
+    let refusal = |why: &str| Err(BadInput(format!("{}: {why}", Setting::EnableMotion)).into());
+    let is_simulated = devices == Devices::Sim || rig.base.driver == BaseDriver::Sim;
+    let has_arm = !rig.arm.joints.is_empty() && rig.arm.driver != ArmDriver::None;
+    if is_simulated {
+        if has_arm {
+            return refusal(
+                "a moving base with an arm cannot be steered in simulation yet: use a rig file \
+                 without an arm or with a fixed base, or remove the flag",
+            );
+        }
+        if devices == Devices::Real && is_any_real(rig) {
+            return refusal(MIXED);
+        }
+        if !super::base_moves(rig) {
+            return refusal("the base of this scene does not move: remove the flag");
+        }
+        if rig.sim.lockstep {
+            return refusal(
+                "a simulation that waits for the trainer has no real time in which a base could be \
+                 steered: remove sim.lockstep from the rig file, or remove the flag",
+            );
+        }
+        return Ok(());
+    }
+    if is_any_simulated(rig) {
+        return refusal(MIXED);
+    }
+    let Some(motion) = &rig.base.motion else {
+        return refusal(
+            "the base can only be read: add a table [base.motion] to the rig file, or remove the \
+             flag",
+        );
+    };
+    if motion.address.is_none() {
+        return refusal(
+            "base.motion.address is missing: set it to the address of the controller of the base, \
+             such as \"192.168.1.5:7020\"",
+        );
+    }
+    if has_arm && motion.stowed.is_empty() {
+        return refusal(
+            "base.motion.stowed is missing: set it to the positions of the arm's joints while the \
+             base moves",
+        );
+    }
+    check_arm(rig)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Override;
+    use std::path::Path;
+
+    fn refusal(name: &str, overrides: &[Override], devices: Devices) -> Option<String> {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
+        let rig = Rig::load(&folder.join(name), overrides).expect("a rig of this repository");
+        assert!(is_base_steered(&rig, devices));
+        let error = check_drivable(&rig, devices).err()?;
+        Some(format!("{error:#}"))
+    }
+
+    #[test]
+    fn bases_are_driven_only_if_the_rig_says_how_and_where_the_arm_is_stowed() {
+        let real = [
+            Override::new("base.driver", "udp"),
+            Override::new("arm.driver", "udp"),
+            Override::new("camera.wrist.driver", "v4l2"),
+        ];
+        let with = |more: &[Override]| [&real[..], more].concat();
+        let address = Override::new("base.motion.address", "127.0.0.1:7020");
+        let stowed = Override::new("base.motion.stowed", vec![0.0; 7]);
+        for (overrides, expected) in [
+            (&real[..1], Some("all must be simulated")),
+            (&real[..], Some("no table")),
+            (
+                &with(&[Override::new("base.motion.max_yaw_rad_s", 0.3)]),
+                Some("base.motion.address is missing"),
+            ),
+            (
+                &with(std::slice::from_ref(&address)),
+                Some("base.motion.stowed is missing"),
+            ),
+            (&with(&[address, stowed]), None),
+        ] {
+            let refusal = refusal("mobile-arm.toml", overrides, Devices::Real);
+            match expected {
+                None => assert_eq!(refusal, None),
+                Some("no table") => {
+                    let refusal = refusal.unwrap_or_default();
+                    assert!(refusal.contains("[base.motion]"), "{refusal}");
+                }
+                Some(words) => {
+                    let refusal = refusal.unwrap_or_default();
+                    assert!(refusal.contains(words), "{refusal}");
+                }
+            }
+        }
+    }
+
+    #[cfg(feature = "sim")]
+    #[test]
+    fn simulated_bases_without_arms_are_driven_in_real_time() {
+        assert_eq!(refusal("mobile-base.toml", &[], Devices::Sim), None);
+        let lockstep = [Override::new("sim.lockstep", true)];
+        let refused = refusal("mobile-base.toml", &lockstep, Devices::Sim).unwrap_or_default();
+        assert!(refused.contains("waits for the trainer"), "{refused}");
+        let refused = refusal("mobile-arm.toml", &[], Devices::Sim).unwrap_or_default();
+        assert!(refused.contains("base with an arm"), "{refused}");
+    }
+}

@@ -1,0 +1,5 @@
+"""The part of rclpy.executors that ros2_drive.py uses."""
+
+
+class ExternalShutdownException(Exception):
+    pass
