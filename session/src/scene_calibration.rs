@@ -11,7 +11,7 @@ use capture::config::{Parent, Rig};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
 use messages::{InsufficientData, Setting, counted};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Result of the calibration.
@@ -156,6 +156,11 @@ pub fn calibrate_scene(
             reasons.entry(camera).or_insert(reason);
         }
     }
+    for camera in without_depth(&keyframes) {
+        let reason = "it has no depth, and cameras with depth are calibrated without it. Use a target, or a recording \
+                      of cameras without depth only";
+        reasons.entry(camera).or_insert_with(|| reason.to_owned());
+    }
     let refused = reasons;
     let rig = rig
         .map(|given| corrected(given, &alignment, &refused))
@@ -165,6 +170,22 @@ pub fn calibrate_scene(
         rig,
         refused,
     })
+}
+
+/// Cameras without any depth, if other cameras have depth.
+fn without_depth(keyframes: &[Arc<Keyframe>]) -> BTreeSet<String> {
+    let (with, without): (Vec<_>, Vec<_>) = keyframes
+        .iter()
+        .partition(|keyframe| keyframe.depth.is_some());
+    let names = |keyframes: Vec<&Arc<Keyframe>>| -> BTreeSet<String> {
+        let names = keyframes.iter().map(|keyframe| keyframe.camera.to_string());
+        names.collect()
+    };
+    let with = names(with);
+    if with.is_empty() {
+        return BTreeSet::new();
+    }
+    &names(without) - &with
 }
 
 /// Cameras with a significant correction of their extrinsics that does not hold for their own
@@ -319,6 +340,7 @@ fn corrected(
 mod tests {
     use super::*;
     use calibration::Trial;
+    use calibration::scenes::{Miscalibration, capture};
 
     fn trial(set: ParamSet, gains_db: &[f64]) -> Trial {
         let by_camera = gains_db.iter().map(|gain_db| ("fixed", *gain_db));
@@ -342,6 +364,26 @@ mod tests {
         assert!(
             unreliable(&alignment, &[], &choice).is_empty(),
             "no camera was moved"
+        );
+    }
+
+    #[test]
+    fn cameras_without_depth_are_named_beside_cameras_with_depth() {
+        let keyframe = |camera: &str, has_depth: bool| {
+            let mut keyframe = (*capture(&Miscalibration::none())[0]).clone();
+            keyframe.camera = camera.into();
+            keyframe.depth = keyframe.depth.filter(|_| has_depth);
+            Arc::new(keyframe)
+        };
+        // A depth image can be missing in some keyframes.
+        let wrist = [keyframe("wrist", true), keyframe("wrist", false)];
+        let overview = keyframe("overview", false);
+        assert!(without_depth(&wrist).is_empty());
+        assert!(without_depth(std::slice::from_ref(&overview)).is_empty());
+        let both = [wrist.to_vec(), vec![overview]].concat();
+        assert_eq!(
+            without_depth(&both),
+            BTreeSet::from(["overview".to_owned()])
         );
     }
 
