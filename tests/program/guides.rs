@@ -132,9 +132,9 @@ const ONLY_PARSED: [(&str, &[&str]); 10] = [
         ],
     ),
     (
-        "they resume or replay: resume.rs and page_replay.rs run them",
+        "they resume or replay: end_to_end.rs and resume.rs run them",
         &[
-            "run RIG.toml --from",
+            "run --from scan.mcap",
             "run rigs/static-arm.toml --resume",
             "train scan.mcap --resume",
         ],
