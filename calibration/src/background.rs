@@ -40,7 +40,7 @@ pub struct AlignmentTask {
 }
 
 /// Result of an alignment, and the keyframes in which a robot is masked with its corrections.
-type AlignedKeyframes = (Alignment, RedrawnKeyframes);
+type AlignedKeyframes = Box<(Alignment, RedrawnKeyframes)>;
 
 #[derive(Debug)]
 enum TaskState {
@@ -126,12 +126,13 @@ impl AlignmentTask {
             return Ok(false);
         };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
-        for line in result.iter().flat_map(|(result, _)| result.lines()) {
+        for line in result.iter().flat_map(|aligned| aligned.0.lines()) {
             log::info!("{line}");
         }
-        let Some((mut result, redrawn)) = result else {
+        let Some(aligned) = result else {
             return Ok(false);
         };
+        let (mut result, redrawn) = *aligned;
         if self
             .result
             .as_ref()
@@ -221,7 +222,7 @@ fn aligned(
         ..alignment.clone()
     };
     let redrawn = RedrawnKeyframes::new(&with_movements, originals);
-    Some((alignment, redrawn))
+    Some(Box::new((alignment, redrawn)))
 }
 
 /// Accuracy of extrinsics that were estimated from color: 0.1 degrees and 3 mm.
