@@ -250,7 +250,7 @@ class Runner:
 
 
 def run(programs):
-    """Runs all programs: those of BESIDE on one processor, those of COMPUTING with a low priority, and the others."""
+    """Runs all programs: BESIDE on one processor, COMPUTING with a low priority, and the others."""
     runner = Runner()
     threading.Thread(target=runner.print_progress, args=(programs,), daemon=True).start()
     processors = sorted(os.sched_getaffinity(0))

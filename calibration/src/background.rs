@@ -183,7 +183,7 @@ impl AlignmentTask {
         })
     }
 
-    /// Like [`Self::corrected`], but with the mask of a robot where it was, which takes less time.
+    /// Like [`Self::corrected`], but the mask of a robot is not drawn again, which saves time.
     pub fn moved(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
         self.result
             .as_ref()

@@ -222,10 +222,10 @@ impl CameraCorrection {
         self.moved(&self.remasked(keyframe))
     }
 
-    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration stays
-    /// the same. Only extrinsics, lens and pose of the depth frame move the mask: the other
-    /// corrections do not move the camera relative to the robot, or by less than the margin of the
-    /// mask.
+    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration
+    /// stays the same. Only extrinsics, lens and pose of the depth frame move the mask: the other
+    /// corrections move the camera relative to the robot by less than the margin of the mask, or
+    /// not at all.
     pub fn remasked(&self, keyframe: &Keyframe) -> Keyframe {
         let mut remasked = keyframe.clone();
         let Some(robot) = keyframe.robot.as_ref().filter(|_| self.moves_robot()) else {
@@ -271,8 +271,8 @@ impl CameraCorrection {
         }
     }
 
-    /// The keyframe with corrected pose, intrinsics, depth and readout time, and with the mask of the
-    /// robot where it was.
+    /// The keyframe with corrected pose, intrinsics, depth and readout time. The mask of a robot is
+    /// not drawn again.
     pub fn moved(&self, keyframe: &Keyframe) -> Keyframe {
         let CalibratedCamera {
             world_from_camera,

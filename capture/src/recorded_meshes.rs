@@ -39,7 +39,7 @@ impl RecordedMeshes {
     }
 
     /// Uses these files instead of files on the disk. They belong to the rig of the recording,
-    /// whereas files of the same name on this computer may be those of another robot.
+    /// whereas files of the same name on this computer may belong to another robot.
     #[must_use]
     pub(crate) fn before_files(self) -> Self {
         Self {
@@ -79,7 +79,7 @@ impl RecordedMeshes {
     /// Says that a file is not among them.
     pub(crate) fn without(&self) -> String {
         if self.files.is_empty() {
-            "the recording contains no mesh files, like those of older versions".to_owned()
+            "the recording contains no mesh files, like recordings of older versions".to_owned()
         } else {
             "the recording does not contain it".to_owned()
         }

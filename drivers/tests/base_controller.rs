@@ -1,5 +1,5 @@
-//! Tests of the programs in `scripts/senders` that control a base: they obey the driver of bases, and
-//! stop without it. The packages of ROS 2 are replaced by small fakes in the folder `base_controller`.
+//! Tests of the programs in `scripts/senders` that control a base: they follow commands, and stop
+//! without them. The packages of ROS 2 are replaced by small fakes in the folder `base_controller`.
 #![cfg(unix)]
 #![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -20,7 +20,7 @@ const FORWARD: BaseVelocity = BaseVelocity {
     yaw_rad_s: 0.2,
 };
 
-/// The program, which ends with this value.
+/// The program. Dropping this value ends it.
 struct Controller {
     child: Child,
     address: SocketAddr,
@@ -76,7 +76,7 @@ impl Controller {
     }
 }
 
-/// Drives until the base reports what it should.
+/// Drives until a report of the base meets a condition.
 fn drive_until(
     driver: &mut UdpDrivenBase,
     velocity: &BaseVelocity,

@@ -33,9 +33,9 @@ impl MaskViews {
 }
 
 impl Keyframe {
-    /// Masks a robot: color and ground truth have no alpha and depth has no readings where it may
-    /// be. The mask of an earlier robot is removed. Returns the number of pixels of the color image
-    /// that the robot covers. A keyframe without pixels is not changed.
+    /// Masks a robot. Where it may be, the alpha of color and ground truth becomes 0, and depth has
+    /// no readings. The mask of an earlier robot is removed. Returns the number of pixels of the
+    /// color image that the robot covers. A keyframe without pixels is not changed.
     ///
     /// * `views`: lenses of the sizes of the images.
     pub fn mask_robot(&mut self, mut robot: MaskedRobot, views: &MaskViews) -> u64 {
@@ -91,7 +91,7 @@ fn covered(
     (0..height).flat_map(move |y| (0..width).map(move |x| silhouette.covers(x, y)))
 }
 
-/// Shows the pixels of some runs, and then hides those of others.
+/// Shows the pixels of the runs `shown`, and then hides the pixels of the runs `hidden`.
 fn hide_color(rgba: &mut Arc<[u8]>, shown: &[[u32; 2]], hidden: &[[u32; 2]]) {
     let (rgba, _) = Arc::make_mut(rgba).as_chunks_mut::<4>();
     for (runs, alpha) in [(shown, 255), (hidden, 0)] {
@@ -102,9 +102,9 @@ fn hide_color(rgba: &mut Arc<[u8]>, shown: &[[u32; 2]], hidden: &[[u32; 2]]) {
     }
 }
 
-/// Shows the readings that were hidden, and hides those that a robot covers.
+/// Restores the readings that were hidden, and hides the readings that a robot covers.
 ///
-/// * `after`: gets what is hidden.
+/// * `after`: receives the hidden readings.
 fn hide_depth(
     depth: &mut DepthMap,
     before: &HiddenPixels,

@@ -3,8 +3,7 @@
 //!
 //! Source of the format: Khronos, "COLLADA: Digital Asset Schema Release 1.4.1" (2008), chapter 5.
 //! Materials, normals, lines, curves and skins are not read. Like `RViz` and the page, this reader
-//! uses the coordinates as they are, whatever `<up_axis>` says: robot descriptions are written for
-//! programs that do so.
+//! ignores `<up_axis>`, because robot descriptions are written for programs that ignore it.
 
 use crate::Error;
 use crate::xml_limits::{self, MAX_NODES};
@@ -13,7 +12,7 @@ use roxmltree::{Document, Node, ParsingOptions};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-/// Maximum size of a file, bytes. It is that of all mesh files of robots.
+/// Maximum size of a file, bytes, as for all mesh files of robots.
 pub const MAX_BYTES: usize = 64 << 20;
 /// Maximum number of triangles. Nodes may use the same geometry many times, so that a small file
 /// could have any number.
@@ -355,7 +354,7 @@ fn numbers<T: std::str::FromStr>(element: Node<'_, '_>) -> Result<Vec<T>, String
     words
         .map(|word| word.parse().ok())
         .collect::<Option<_>>()
-        .ok_or_else(|| at(element, "it contains something else than numbers"))
+        .ok_or_else(|| at(element, "it contains an invalid number"))
 }
 
 /// The first child element with this name.
@@ -501,7 +500,7 @@ mod tests {
                 "0 0 1 0 9 0",
                 "line 13: <p>: it names a vertex",
             ),
-            ("0 0 1 0 2 0", "0 0 -1 0 2 0", "something else than numbers"),
+            ("0 0 1 0 2 0", "0 0 -1 0 2 0", "an invalid number"),
             ("0 1 0</float_array>", "0 1 inf</float_array>", "not finite"),
             ("stride=\"3\"", "stride=\"2\"", "three coordinates"),
             ("offset=\"1\"", "offset=\"x\"", "not a small number"),

@@ -32,7 +32,7 @@ STOP = (0.0, 0.0, 0.0)
 
 
 class BaseController:
-    """Receives velocities, and says which one the base must have now."""
+    """Receives velocities, and returns the one that the base must have now."""
 
     def __init__(self, listen=LISTEN):
         family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
@@ -64,13 +64,13 @@ class BaseController:
             if command:
                 refusal = self._obey(command, time.monotonic_ns(), fault)
                 self._reply(sender, command, measured, fault, refusal)
-        # Silence stops the base, whatever was wanted last.
+        # Without a newer command, the base stops.
         if time.monotonic_ns() > self._expires_nanos or fault:
             self._velocity = STOP
         return self._velocity
 
     def _obey(self, command, now_nanos, fault):
-        """Why the command is not obeyed; None if it is."""
+        """Why the command is refused; None if it is accepted."""
         is_stop = command["velocity"] == STOP
         if command["session"] != self._session:
             is_free = self._session is None or now_nanos - self._heard_nanos > SESSION_END_NANOS
@@ -102,7 +102,7 @@ class BaseController:
         try:
             self._socket.sendto(json.dumps(reply).encode(), sender)
         except OSError:
-            pass  # Like a reply that is lost: fieldrig repeats a stop until it is confirmed.
+            pass  # The same as a lost reply: fieldrig repeats a stop until it is confirmed.
 
 
 def _command(datagram):

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Lets fieldrig drive a robot of ROS 2 (base.motion.address in rig files). It publishes velocities, so the robot moves.
+"""Lets fieldrig drive a ROS 2 robot (base.motion.address in rig files). It publishes velocities, so the robot moves.
 
     source /opt/ros/jazzy/setup.bash
     scripts/senders/ros2_drive.py --odometry /odom --command /cmd_vel
 
 The odometry (nav_msgs/Odometry) must have the twist of the frame to which the rig file attaches its cameras. Without it,
 the robot does not move. The program publishes while fieldrig moves the robot, and zeros for a second afterward. It
-replaces no emergency stop, and the robot must also stop if this program ends.
+does not replace an emergency stop, and the robot must also stop if this program ends.
 """
 
 import argparse
@@ -21,7 +21,7 @@ ZEROS_SECS = 1.0  # time for which zeros are published after a motion
 
 
 class Relay:
-    """Publishes what the controller wants, and reports what the odometry measures."""
+    """Publishes the velocities of the controller, and reports the measured velocities of the odometry."""
 
     def __init__(self, controller, publish, odometry_topic):
         self._controller = controller

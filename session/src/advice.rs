@@ -96,22 +96,22 @@ pub(crate) struct Situation {
     pub(crate) paused_by: Option<u64>,
 }
 
-/// What recent images have in common.
+/// A common property of recent images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Finding {
-    /// So many did not arrive that this is a problem.
+    /// Many images did not arrive. This is a problem.
     Lost,
-    /// They were rejected for the same reasons, as in this entry of [`REMEDIES`].
+    /// Images were rejected for the reasons in this entry of [`REMEDIES`].
     Rejected(usize),
-    /// Some did not arrive.
+    /// Some images did not arrive.
     Dropped,
 }
 
-/// Advises the operator. It remembers what is shown, so that the advice does not come and go while
-/// the images vary.
+/// Advises the operator. It remembers the shown finding, so that the advice does not appear and
+/// disappear while the images vary.
 #[derive(Debug, Default)]
 pub(crate) struct Advisor {
-    /// What is shown, and the share of the images in its text.
+    /// The shown finding, and the share of the images in its text.
     shown: Option<(Finding, f64)>,
 }
 
@@ -146,7 +146,7 @@ impl Advisor {
         }
     }
 
-    /// What the operator may want to know although nothing is wrong.
+    /// Information for the operator when there is no problem.
     fn hint(&self, situation: &Situation) -> Option<String> {
         let Situation { recent, store, .. } = situation;
         let n_not_moved = recent.rejected.get(Rejection::NotMoved.name());
@@ -203,8 +203,8 @@ pub(crate) fn problem(images: &ImageFlow) -> Option<String> {
     remedy(finding, share)
 }
 
-/// What many of the recent images have in common, the most costly problem first, and the share of
-/// the images that is shown.
+/// The most costly problem of the recent images, or else whether images were dropped, and the share
+/// of the images that is shown.
 ///
 /// * `shown`: the previous result. It is kept while the images are similar.
 #[expect(

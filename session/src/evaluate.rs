@@ -595,8 +595,8 @@ fn comparable_depth(method: &AlignedModel, keyframe: &Keyframe) -> Option<DepthM
     })
 }
 
-/// Whether each pixel of a depth image looks in the same direction from the same place as that of
-/// the color image, as [`render_depth`] and [`draw`] render them.
+/// Whether each pixel of a depth image has the same viewing ray as the pixel of the color image, as
+/// [`render_depth`] and [`draw`] render them.
 fn is_aligned(depth: &DepthMap, lens: &CalibratedCamera, keyframe: &Keyframe) -> bool {
     lens.color_from_depth == Some(Transform::identity())
         && lens.shutter.is_none()

@@ -377,8 +377,8 @@ impl Engine {
         Ok(())
     }
 
-    /// Lets an operator take the base over from its tour. Returns the way of
-    /// the base. `start` is simulated time zero on the clock of the thread that drives it.
+    /// Lets an operator take the base over from its tour. Returns the way of the base. `start` is
+    /// simulated time zero on the clock of the thread that drives it.
     pub(crate) fn steer_base(&mut self, start: Stamp) -> BaseWay {
         let way = BaseWay::new(start, *self.robot.motion());
         self.robot.steer_base(way.clone());

@@ -1,8 +1,8 @@
 //! A simulated base that an operator takes over from its tour.
 //!
-//! Until the operator begins, the base moves on its tour. It then brakes, and follows the velocities
-//! of the thread that drives it, in real time. The thread of the simulation may lag behind, because
-//! it renders: it follows the same way when it gets there.
+//! Until the operator begins, the base moves on its tour. It then brakes, and follows the
+//! velocities of the thread that drives it, in real time. The thread of the simulation may lag
+//! behind, because it renders: it follows the same way when it gets there.
 
 use crate::base::{BaseMotion, smooth};
 use drivers::base_motion::{BaseReport, BaseVelocity, MovableBase};
@@ -16,10 +16,11 @@ use std::time::Duration;
 
 /// How long a velocity lasts without a newer one.
 const VALID_NANOS: i64 = 100_000_000;
-/// Number of velocities that are kept for the simulation: those of two minutes. A simulation that is
-/// later than this has stopped.
+/// Number of velocities that are kept for the simulation: those of two minutes. A simulation that
+/// is later than this has stopped.
 const MAX_LEGS: usize = 6000;
-/// Way of the past that cameras and scanners may still ask for, nanoseconds.
+/// Time for which the past way is kept, because cameras and scanners may still need it,
+/// nanoseconds.
 const PAST_NANOS: i64 = 5_000_000_000;
 /// Maximum time to wait for a velocity, after which the base counts as abandoned and stands still.
 const MAX_WAIT: Duration = Duration::from_secs(2);
@@ -40,7 +41,7 @@ impl SteeredBase {
         Self { way, n_contacts }
     }
 
-    /// Ends the tour: the base brakes, and obeys from then on.
+    /// Ends the tour: the base brakes, and then follows velocities.
     pub fn begin(&self) {
         self.way.0.state.lock().is_wanted = true;
     }

@@ -47,8 +47,9 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Let operators steer the arm, or a base that moves, from the page. Confirms that nobody is
-    /// within reach of a real robot, and that a hand is on the emergency stop. A real arm also needs
-    /// the table arm.motion in the rig file, a real base base.motion. Not restored by --resume
+    /// within reach of a real robot, and that a hand is on the emergency stop. A real arm also
+    /// needs the table arm.motion in the rig file, and a real base the table base.motion. Not
+    /// restored by --resume
     #[arg(long, conflicts_with = "from")]
     enable_motion: bool,
     /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder

@@ -13,10 +13,10 @@ const TIMEOUT: Duration = Duration::from_secs(300);
 const COMMAND_PERIOD: Duration = Duration::from_millis(25);
 /// How far the base is driven, meters.
 const DISTANCE_M: f64 = 0.3;
-/// Largest difference between the heading and the direction of the way. The newest pose is a moment
-/// old when a motion begins.
+/// Largest difference between the heading and the direction of the motion. The newest pose is a
+/// moment old when a motion begins.
 const MAX_OFF_RAD: f64 = 0.05;
-/// How far from its goal a base has arrived, meters.
+/// Largest distance between a base that has arrived and its goal, meters.
 const AT_GOAL_M: f64 = 0.1;
 
 /// A page that drives the base.
@@ -99,8 +99,8 @@ impl Driver {
         }));
     }
 
-    /// Holds the switch until the state is as it should be, then releases it. A pause of this program
-    /// lets the base brake, so the operator grips again whenever it does not follow.
+    /// Holds the switch until the state is as it should be, then releases it. A pause of this
+    /// program lets the base brake, so the operator grips again whenever it does not follow.
     fn hold_until(&mut self, intent: &Value, is_reached: impl Fn(&Self) -> bool) {
         let began = Instant::now();
         let mut n_unfollowed = 0;

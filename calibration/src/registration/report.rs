@@ -458,7 +458,7 @@ impl Alignment {
         }
     }
 
-    /// The keyframe with these corrections, and with the mask of the robot where it was.
+    /// The keyframe with these corrections. The mask of a robot is not drawn again.
     pub fn moved(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
         let movements = self.movement_correction(&keyframe.camera, keyframe.stamp);
         let corrections = movements
@@ -469,8 +469,8 @@ impl Alignment {
         })
     }
 
-    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration stays
-    /// the same.
+    /// The keyframe with the mask of the robot as the corrected camera sees it. Its calibration
+    /// stays the same.
     pub fn remasked<'a>(&self, keyframe: &'a Keyframe) -> Cow<'a, Keyframe> {
         if keyframe.robot.is_none() {
             return Cow::Borrowed(keyframe);

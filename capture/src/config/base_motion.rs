@@ -26,8 +26,8 @@ keys! {
         pub brake_m_s2: f64 = 0.6, in 0.01..=20.0;
         /// Yaw deceleration of braking, rad/s²; at least `yaw_acceleration_rad_s2`.
         pub brake_yaw_rad_s2: f64 = 1.2, in 0.01..=40.0;
-        /// Rectangle on the floor that the base link stays in, m: smallest x and y, then largest x and
-        /// y, in the world. Without it, nothing bounds the way of the base.
+        /// Rectangle on the floor that the base link stays in, m: smallest x and y, then largest x
+        /// and y, in the world. Without it, the base may drive anywhere.
         pub area_m: Option<[f64; 4]>, in -10000.0..=10000.0;
         /// Positions of the arm's joints while the base moves, radians or meters, in the order of
         /// `arm.joints`. A robot with an arm needs this key.

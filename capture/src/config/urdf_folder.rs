@@ -6,8 +6,8 @@ use files::Budget;
 use std::path::{Path, PathBuf};
 
 /// Folder of the robot description of a rig that was read from a file, and the mesh files of a
-/// recording. Mesh files are named relative to the folder. Neither is part of the rig: two rigs that
-/// differ only in this value are equal.
+/// recording. Mesh files are named relative to the folder. Neither is part of the rig: two rigs
+/// that differ only in this value are equal.
 #[derive(Clone, Debug, Default)]
 pub struct UrdfFolder {
     folder: Option<PathBuf>,
@@ -50,9 +50,9 @@ impl UrdfFolder {
         self.folder.as_deref()
     }
 
-    /// Contents of a mesh file, with at most `budget.max_bytes` bytes. If the rig is that of a
-    /// recording, the mesh files of the recording come first. Otherwise, they only replace missing
-    /// files.
+    /// Contents of a mesh file, with at most `budget.max_bytes` bytes. If the rig comes from
+    /// a recording, the mesh files of the recording come first. Otherwise, they only replace
+    /// missing files.
     ///
     /// # Errors
     ///
@@ -131,8 +131,8 @@ mod tests {
             (
                 &elsewhere,
                 Some(&none),
-                "the recording contains no mesh files, like those of older versions, and no such file; relative names start \
-                 at /nowhere",
+                "the recording contains no mesh files, like recordings of older versions, and no such file; relative names \
+                 start at /nowhere",
             ),
             (
                 &UrdfFolder::default(),

@@ -9,9 +9,9 @@ use kinematics::urdf::Robot;
 use messages::counted;
 use std::collections::BTreeSet;
 
-/// Reads and compresses the mesh files of a robot: those of collision shapes, which are small and
-/// protect the robot, then those of visual shapes. Warns about files that are left out, because
-/// they cannot be read or because all together would be too large.
+/// Reads and compresses the mesh files of a robot. The files of collision shapes come first,
+/// because they are small and protect the robot. Warns about files that are left out, because they
+/// cannot be read or because all files together would be too large.
 ///
 /// This takes a second for large meshes, so call it before devices are opened.
 #[must_use]
@@ -63,7 +63,7 @@ fn compressed(
         let with_this = n_bytes + bytes.len() as u64;
         if with_this > max_bytes {
             left_out.push(format!(
-                "{file:?}: all mesh files together would have more than {} MiB, compressed; reduce their triangles",
+                "{file:?}: all mesh files together would exceed {} MiB after compression; reduce the number of triangles",
                 max_bytes >> 20
             ));
             continue;

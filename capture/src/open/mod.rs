@@ -177,10 +177,10 @@ pub fn rig(rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     Ok(opened)
 }
 
-/// Opens the devices of a rig with a function, which also returns what operators steer.
+/// Opens the devices of a rig with a function, which also returns the steered arm or base.
 ///
-/// * `open`: gets the rig with all settings resolved, and the driver of the arm in the rig file, which
-///   a simulation may have replaced.
+/// * `open`: gets the rig with all settings resolved, and the driver of the arm in the rig file,
+///   which a simulation may have replaced.
 fn open_rig_with<T>(
     mut rig: Rig,
     devices: Devices,

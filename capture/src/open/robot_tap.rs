@@ -1,5 +1,6 @@
-//! What the base and the arm of a run report, for a program that cannot wait for the input of the
-//! run: the input waits while the trainer is busy, but each device is read by its own thread.
+//! The newest reports of the base and the arm of a run, for a program that cannot wait for the
+//! input of the run. The input waits while the trainer is busy, but each device is read by its own
+//! thread.
 
 use drivers::{Arm, Base, BasePose, Error, FlangeDifference};
 use kinematics::JointState;
@@ -18,7 +19,7 @@ struct Reports {
 }
 
 impl RobotTap {
-    /// A base whose poses are also noted here.
+    /// A base whose poses are also stored here.
     pub(super) fn of_base(&self, base: Box<dyn Base>) -> Box<dyn Base> {
         Box::new(TappedBase {
             base,
@@ -26,7 +27,7 @@ impl RobotTap {
         })
     }
 
-    /// An arm whose joint states are also noted here.
+    /// An arm whose joint states are also stored here.
     pub(super) fn of_arm(&self, arm: Box<dyn Arm>) -> Box<dyn Arm> {
         Box::new(TappedArm {
             arm,

@@ -42,8 +42,8 @@ impl SteeredBase {
     }
 
     /// The newest pose that the base or its localization has reported, without the corrections of
-    /// stations; `None` if it comes from the images of the run. It does not wait for the input of the
-    /// run.
+    /// stations; `None` if it comes from the images of the run. It does not wait for the input of
+    /// the run.
     #[must_use]
     pub fn reported_pose(&self) -> Option<BasePose> {
         #[cfg(feature = "sim")]
@@ -57,15 +57,15 @@ impl SteeredBase {
         self.tap.pose()
     }
 
-    /// The newest joint state of the arm on the base, without `arm.joint_offsets`; `None` without an
-    /// arm. It does not wait for the input of the run.
+    /// The newest joint state of the arm on the base, without `arm.joint_offsets`; `None` without
+    /// an arm. It does not wait for the input of the run.
     #[must_use]
     pub fn reported_joints(&self) -> Option<JointState> {
         self.tap.joints()
     }
 
-    /// Takes the base over, or stops it. A simulated base brakes and ends its tour; a real base stands
-    /// still anyway.
+    /// Takes the base over, or stops it. A simulated base ends its tour and brakes. A real base has
+    /// no tour.
     pub fn begin(&self) {
         #[cfg(feature = "sim")]
         if let Some(base) = &self.simulated {
@@ -73,8 +73,8 @@ impl SteeredBase {
         }
     }
 
-    /// How often a part of the robot has touched the scene; `None` if it is not counted, as for real
-    /// robots.
+    /// How often a part of the robot has touched the scene; `None` if it is not counted, as for
+    /// real robots.
     #[must_use]
     pub fn n_contacts(&self) -> Option<u64> {
         #[cfg(feature = "sim")]

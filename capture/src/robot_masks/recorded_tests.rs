@@ -118,7 +118,7 @@ fn a_replay_without_the_mesh_files_masks_the_robot_as_the_live_run() {
     let masks = super::RobotMasks::new(&stored).expect("a good rig");
     let warning = masks.and_then(|masks| masks.warning()).expect("no shape");
     assert!(
-        warning.contains("the recording contains no mesh files, like those of older versions"),
+        warning.contains("the recording contains no mesh files, like recordings of older versions"),
         "{warning}"
     );
 }

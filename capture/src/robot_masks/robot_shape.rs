@@ -20,7 +20,7 @@ const MAX_POSES: u32 = 16;
 pub(super) struct RobotShape {
     root_from_base: JointedPose,
     links: Vec<Link>,
-    /// The pieces of each link. A link has none if its shape is unknown, or if it has none.
+    /// The pieces of each link. Empty for a link without a shape, or with an unknown shape.
     pieces: Arc<[Vec<ConvexPiece>]>,
     /// Names of links whose shapes are not known, with the reason.
     unknown: BTreeMap<String, String>,
@@ -286,7 +286,8 @@ fn n_poses_of(limits: &JointLimits, is_prismatic: bool) -> u32 {
 struct Meshes<'a> {
     folder: &'a UrdfFolder,
     read: BTreeMap<String, Result<Vec<Triangle>, String>>,
-    /// What all further files may have together. A small recording could contain any amount.
+    /// Maximum size of all further files together. After decompression, the files of a small
+    /// recording could have any size.
     left: Budget,
 }
 

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 /// Period of the velocities: 50 Hz, as most controllers of bases expect.
 const PERIOD: Duration = Duration::from_millis(20);
-/// Maximum time at the end until the base confirms that it stands still.
+/// Maximum time at the end to wait for the base to confirm that it stands still.
 const MAX_STOP: Duration = Duration::from_secs(3);
 
 /// A base that is driven on a separate thread. Dropping this value lets the base brake, and waits
@@ -69,7 +69,7 @@ fn run(mut cycle: DriveCycle, must_end: &AtomicBool) {
         cycle.step(clock::now());
         due += PERIOD;
         let now = Instant::now();
-        // After a pause of the computer, the missed cycles are not made up for.
+        // After a pause of the computer, the missed cycles are skipped.
         due = due.max(now);
         std::thread::sleep(due - now);
     };
@@ -112,7 +112,8 @@ impl DriveCycle {
     /// Takes orders, and sets the velocity of the base.
     pub(super) fn step(&mut self, now: Stamp) {
         self.report = self.base.report(now);
-        // A base on its tour does not obey, so that braking begins after it, at the velocity there.
+        // A base on its tour ignores velocities. Braking begins at the end of the tour, from the
+        // velocity there.
         if self.report.is_on_tour
             && let Err(error) = self.follower.resume(now, self.report.velocity)
         {
@@ -142,7 +143,7 @@ impl DriveCycle {
     /// Brakes. Returns whether the base stands still.
     fn brake_for_end(&mut self) -> bool {
         self.follower.brake(u64::MAX);
-        // A base on its tour was never driven, and one that never reported cannot confirm.
+        // A base on its tour was never driven, and a base that never reported cannot confirm.
         self.report.is_on_tour || self.report.reported_at.is_none() || self.is_at_rest()
     }
 

@@ -83,13 +83,13 @@ impl BaseFollower {
         self.end_motion();
     }
 
-    /// Continues from a velocity that the base has by itself at a time, and brakes from there.
+    /// Sets the velocity of a base that moved without targets until now, and brakes from there.
     ///
     /// # Errors
     /// If the velocity is not finite.
     pub fn resume(&mut self, now: Stamp, velocity: BaseVelocity) -> Result<(), Error> {
         if !velocity.is_finite() {
-            return Err(base_error("its own velocity is not finite".to_owned()));
+            return Err(base_error("its present velocity is not finite".to_owned()));
         }
         self.end_motion();
         self.stepped_at = Some(now);
@@ -101,7 +101,7 @@ impl BaseFollower {
     pub fn step(&mut self, now: Stamp) -> BaseVelocity {
         let since_last = self.stepped_at.map_or(0.0, |last| now.secs_since(last));
         let secs = since_last.clamp(0.0, MAX_STEP_SECS);
-        // A clock that goes back would keep a target alive.
+        // A target would last longer if the clock went back.
         let went_back = since_last < 0.0;
         self.stepped_at = Some(now);
         if self
@@ -146,7 +146,7 @@ fn approach(
     let left = wanted.left_m_s - velocity.left_m_s;
     let change_m_s = forward.hypot(left);
     let yaw = wanted.yaw_rad_s - velocity.yaw_rad_s;
-    // The end is reached exactly, so that a base at rest has exactly zero.
+    // `wanted` is reached exactly, so that the velocity of a base at rest is exactly zero.
     let (forward_m_s, left_m_s) = if change_m_s <= linear_m_s {
         (wanted.forward_m_s, wanted.left_m_s)
     } else {

@@ -1,9 +1,9 @@
 //! Bases that may be driven: velocities that expire, their limits, and the thread that passes them
 //! to the base.
 //!
-//! A program sends targets through a [`BasePort`]. The thread of the base ([`BaseDrive`]) turns them
-//! into velocities within the limits ([`BaseFollower`]), and brakes as soon as a target expires,
-//! whatever happens to the rest of the program.
+//! A program sends targets through a [`BasePort`]. The thread of the base ([`BaseDrive`]) turns
+//! them into velocities within the limits ([`BaseFollower`]), and brakes as soon as a target
+//! expires, whatever happens to the rest of the program.
 
 mod drive;
 mod follower;
@@ -38,24 +38,24 @@ pub trait MovableBase: Send {
     /// If the base cannot be reached from this computer. The next call tries again.
     fn drive(&mut self, now: Stamp, velocity: &BaseVelocity) -> Result<(), Error>;
 
-    /// What the base has reported up to now.
+    /// The newest report of the base.
     fn report(&mut self, now: Stamp) -> BaseReport;
 }
 
-/// What a base has reported.
+/// Report of a base.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BaseReport {
     /// When the newest report arrived; `None` before the first.
     pub reported_at: Option<Stamp>,
     /// Measured velocity.
     pub velocity: BaseVelocity,
-    /// Whether the base has confirmed that it was told to stand still.
+    /// Whether the base has confirmed the command to stand still.
     pub is_stop_confirmed: bool,
-    /// Whether the base still moves by itself, as a simulated base does on its tour. It then does
-    /// not obey.
+    /// Whether the base still moves without commands, as a simulated base does on its tour. It then
+    /// ignores velocities.
     pub is_on_tour: bool,
     /// Why the base cannot move, if it reports a fault.
     pub fault: Option<String>,
-    /// Why the base did not obey the newest velocity, if it says so.
+    /// Why the base refused the newest velocity, if it did.
     pub refusal: Option<String>,
 }

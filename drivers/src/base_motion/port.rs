@@ -22,7 +22,7 @@ struct Exchange {
     state: Option<BaseState>,
 }
 
-/// What the base's thread has not taken yet.
+/// Orders that the base's thread has not taken yet.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct BaseOrders {
     /// Brake, and end all motions up to this number. This comes before the target.
@@ -40,9 +40,9 @@ impl BasePort {
         }))
     }
 
-    /// Sends the base's thread what the base should do. The newest target replaces the ones that the
-    /// thread has not taken yet. No target replaces the order to brake, which ends the motions of all
-    /// targets before it.
+    /// Sends an output to the base's thread. A new target replaces a target that the thread has not
+    /// taken yet. It does not replace an order to brake, which ends the motions of all earlier
+    /// targets.
     pub fn send(&self, output: &BaseOutput) {
         let mut exchange = self.0.exchange.lock();
         match output {
@@ -71,7 +71,7 @@ impl BasePort {
         &self.0.limits
     }
 
-    /// Takes what was sent since the last call.
+    /// Takes the orders that were sent since the last call.
     pub(super) fn take_orders(&self) -> BaseOrders {
         std::mem::take(&mut self.0.exchange.lock().orders)
     }

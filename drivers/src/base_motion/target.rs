@@ -1,4 +1,4 @@
-//! What passes between a chain of decisions and the thread of a base.
+//! Messages between a chain of decisions and the thread of a base.
 
 use super::BaseVelocity;
 use crate::motion::exact;
@@ -37,12 +37,12 @@ pub struct BaseState {
     pub reported_at: Stamp,
     /// Measured velocity.
     pub velocity: BaseVelocity,
-    /// Whether the base was told to stand still, has confirmed this, and measures no motion.
+    /// Whether the base was commanded to stand still, has confirmed this, and measures no motion.
     pub is_at_rest: bool,
     /// The greatest number of a motion that ended because the base braked; 0 if it never did.
     pub braked_motion: u64,
     /// Why the base cannot move, if it reports a fault.
     pub fault: Option<String>,
-    /// Why the base did not obey the newest velocity, if it says so.
+    /// Why the base refused the newest velocity, if it did.
     pub refusal: Option<String>,
 }

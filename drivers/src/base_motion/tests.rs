@@ -187,7 +187,7 @@ fn limits_that_are_not_positive_or_brake_too_little_are_refused() {
     }
 }
 
-/// A base that has every velocity at once, and what it was told.
+/// A base that reaches every velocity immediately, and its commands.
 #[derive(Clone, Default)]
 struct IdealBase(Arc<Mutex<BaseReport>>);
 

@@ -49,13 +49,13 @@ impl BaseVelocity {
         self.to_array().iter().all(|number| number.is_finite())
     }
 
-    /// Whether a base that measures this velocity counts as standing still. Odometry has noise, and a
-    /// robot on legs sways.
+    /// Whether a base that measures this velocity counts as standing still. Odometry has noise, and
+    /// a robot on legs sways.
     #[must_use]
     pub fn is_rest(self) -> bool {
         const REST_M_S: f64 = 0.03;
         const REST_RAD_S: f64 = 0.05;
-        // Written so that NaN is no rest.
+        // Written so that NaN does not count as rest.
         self.speed_m_s() <= REST_M_S && self.yaw_rad_s.abs() <= REST_RAD_S
     }
 }

@@ -20,7 +20,7 @@ use std::sync::Arc;
 
 /// Maximum number of unused topics, attachments and metadata that are reported.
 const MAX_UNUSED: usize = 50;
-/// Maximum length of the names of all mesh files. A robot has at most some hundred mesh files.
+/// Maximum length of the names of all mesh files. A robot has at most a few hundred mesh files.
 const MAX_MESH_NAME_BYTES: u64 = 1 << 20;
 /// Maximum number of unused parts in the error about a recording without samples.
 const MAX_UNUSED_IN_ERROR: usize = 5;

@@ -9,9 +9,10 @@ use kinematics::Stamp;
 use std::io::ErrorKind;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 
-/// How long a velocity lasts without a newer one. Five commands in a row may be lost.
+/// How long a velocity lasts without a newer one. At 50 Hz, three commands in a row may be lost.
 const VALID_SECS: f64 = 0.1;
-/// Time between two repetitions of a stop that the base has confirmed. They keep its replies coming.
+/// Time between two repetitions of a stop that the base has confirmed. They keep its replies
+/// coming.
 const CONFIRMED_PERIOD_SECS: f64 = 0.09;
 /// Maximum number of replies that are read at once.
 const MAX_REPLIES: usize = 64;
@@ -35,7 +36,7 @@ pub struct UdpDrivenBase {
 impl UdpDrivenBase {
     /// Opens a socket for a base at an address.
     ///
-    /// * `session`: another number than that of each earlier program.
+    /// * `session`: a number that no earlier program has used.
     ///
     /// # Errors
     /// If no socket can be opened.
@@ -92,8 +93,8 @@ impl UdpDrivenBase {
     fn receive(&mut self, now: Stamp) {
         let mut bytes = [0; MAX_REPLY_BYTES];
         for _ in 0..MAX_REPLIES {
-            // An error is that of an earlier command, such as a port on which nobody listens. The
-            // silence of the base shows it.
+            // An error belongs to an earlier command, for example if no program listens on the
+            // port. The chain of decisions detects that replies are missing.
             let Ok(n_bytes) = self.socket.recv(&mut bytes) else {
                 return;
             };

@@ -1,5 +1,5 @@
-//! An emulated controller of a base, on a real UDP socket. It obeys as `docs/reference/udp.md` asks
-//! of controllers.
+//! An emulated controller of a base, on a real UDP socket. It follows the rules for controllers in
+//! `docs/reference/udp.md`.
 
 use crate::base_motion::BaseVelocity;
 use crate::wire::base_drive::{DriveCommand, DriveReply, decode_command, encode_reply};
@@ -67,8 +67,8 @@ impl EmulatedBase {
         self.n_accepted
     }
 
-    /// One cycle of the controller: takes the datagrams that have arrived, and ends what has
-    /// expired.
+    /// One cycle of the controller: takes the datagrams that have arrived, and ends an expired
+    /// velocity.
     ///
     /// * `now_nanos`: time on the clock of the base.
     pub fn cycle(&mut self, now_nanos: i64) {
@@ -87,7 +87,7 @@ impl EmulatedBase {
                 refusal: refusal.map(str::to_owned),
             };
             if self.replies {
-                // A lost reply is a case that senders must cope with.
+                // Senders must tolerate lost replies.
                 let _ = self.socket.send_to(&encode_reply(&reply), sender);
             }
         }

@@ -1,4 +1,5 @@
-//! Fuzz target for datagrams of an arm, a base and a range scanner, and for those that drive a base.
+//! Fuzz target for datagrams of an arm, a base and a range scanner, and for those that drive a
+//! base.
 
 use super::reader::DatagramReader;
 use super::scanner::UdpScanner;
@@ -57,8 +58,8 @@ pub fn datagrams(bytes: &[u8]) {
     joint_states(bytes);
 }
 
-/// Reads a line as a command to a base, and as its reply. What is accepted must be possible, and
-/// survive its own text.
+/// Reads a line as a command to a base, and as its reply. Accepted messages must have possible
+/// velocities, and be unchanged after encoding and decoding.
 fn check_driving(line: &[u8]) {
     let is_possible = |velocity: BaseVelocity| velocity.is_finite() && velocity.speed_m_s() < 200.0;
     if let Ok(command) = decode_command(line) {

@@ -20,7 +20,7 @@ const REPLY: &str = "drive_state";
 /// A velocity for a base.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DriveCommand {
-    /// Number of the program that sends, new with each start.
+    /// Number that identifies the sending program, new with each start.
     pub session: u64,
     /// Number of the command, which increases.
     pub seq: u64,
@@ -38,13 +38,13 @@ pub struct DriveReply {
     pub session: u64,
     /// Number of the command.
     pub seq: u64,
-    /// Now on a clock of the base that runs at a constant rate, nanoseconds.
+    /// Current time on a clock of the base that runs at a constant rate, nanoseconds.
     pub stamp_nanos: i64,
     /// Measured velocity.
     pub velocity: BaseVelocity,
     /// Why the base cannot move; `None` if it can.
     pub fault: Option<String>,
-    /// Why the base does not obey the command; `None` if it does.
+    /// Why the base refuses the command; `None` if it accepts it.
     pub refusal: Option<String>,
 }
 

@@ -1,5 +1,5 @@
-//! Whether anybody may move a robot now: the lease, the dead-man switch and stops together, for
-//! chains that have their own limits after them.
+//! Decides whether an operator may move a robot now, from the lease, the dead-man switch and stops.
+//! Each chain of decisions applies its own limits afterward.
 
 use crate::check::positive;
 use crate::clutch::{Change, Clutch, ClutchConfig, ClutchState, Held};
@@ -116,10 +116,10 @@ impl Authority {
         self.clutch.deadline()
     }
 
-    /// Notes the time, and ends what has expired.
+    /// Sets the time, and ends an expired lease.
     pub(crate) fn advance(&mut self, now: Stamp) {
         if let Some(latest) = self.latest_nanos.map(Stamp).filter(|latest| now < *latest) {
-            // After a step back, nothing would expire for as long as the step.
+            // After a step back, nothing would expire for the duration of this step.
             self.lease.end();
             self.end_control(Reason::ClockWentBack {
                 secs: latest.secs_since(now),
@@ -184,7 +184,7 @@ impl Authority {
         Err(self.last_brake.clone().unwrap_or(missing))
     }
 
-    /// Ends the motion and uses the grip up. Returns its arguments.
+    /// Ends the motion and its grip. Returns its arguments.
     pub(crate) fn brake(&mut self, link: Link, reason: Reason) -> (Link, Reason) {
         self.clutch.open();
         self.last_brake = Some((link, reason.clone()));
@@ -221,7 +221,7 @@ impl Authority {
                 if was_held && self.clutch.held().is_none() {
                     self.brake(Link::Clutch, reason.clone());
                 }
-                // During a stop, this is what the operator must know first.
+                // During a stop, the reason of the stop is more important to the operator.
                 Err(self.stop().map_or(reason, |(_, stop)| stop.clone()))
             }
             Ok(Change::Closed) => {

@@ -4,15 +4,15 @@ use crate::base_verdict::FloorPose;
 use crate::reason::Reason;
 use drivers::base_motion::{BaseLimits, BaseVelocity};
 
-/// Time from a decision until the base obeys, seconds: the age of its pose, the way of the command,
-/// and the reaction of its controller. The base covers this time's distance before it slows down.
+/// Time until the base reacts to a decision, seconds: the age of its pose, the transmission of the
+/// command, and the reaction of its controller. During this time, the base does not slow down.
 const REACTION_SECS: f64 = 0.35;
 /// Distance from the edge at which the base stops, meters: its pose has errors of this size.
 const STOP_BEFORE_M: f64 = 0.02;
 /// Number of headings that are compared while the base turns.
 const N_HEADINGS: u32 = 7;
-/// A base is too fast toward an edge if its measured speed is this many times the permitted one, and
-/// the noise of odometry above it.
+/// A base is too fast toward an edge if its measured speed is this many times the permitted one,
+/// and the noise of odometry above it.
 const TOO_FAST: f64 = 1.05;
 const NOISE_M_S: f64 = 0.01;
 
@@ -26,7 +26,7 @@ pub(crate) struct Area {
 }
 
 impl Area {
-    /// The area of its four numbers: smallest x and y, then largest x and y.
+    /// The area with these limits: smallest x and y, then largest x and y.
     pub(crate) fn of([x0, y0, x1, y1]: [f64; 4]) -> Self {
         Self {
             lower: [x0, y0],
@@ -40,12 +40,12 @@ impl Area {
         (0..2).all(|axis| (self.lower[axis]..=self.upper[axis]).contains(&place[axis]))
     }
 
-    /// The velocity with which the base can stop before the edge. If it is slower than `wanted`, also
-    /// the factor on the speed, 0 to 1, and the reason. A motion away from an edge is always
+    /// The velocity with which the base can stop before the edge. If it is slower than `wanted`,
+    /// also the factor on the speed, 0 to 1, and the reason. A motion away from an edge is always
     /// permitted.
     ///
-    /// * `measured`: the velocity that the base has. If it is too fast toward an edge, in whatever
-    ///   direction it should move next, it first comes to rest without turning.
+    /// * `measured`: the velocity that the base has. If it is too fast toward an edge, the base
+    ///   first comes to rest without turning, for every `wanted`.
     pub(crate) fn permitted(
         &self,
         pose: &FloorPose,

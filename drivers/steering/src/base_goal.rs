@@ -1,29 +1,30 @@
-//! The way of a base to a goal on the floor.
+//! Velocities that bring a base to a goal on the floor.
 //!
-//! A base that can move sideways drives straight to the goal and turns on the way. Any other base
-//! turns toward the goal, drives to it, and turns to the heading there. The velocity depends only on
-//! the pose, so the base continues from wherever it was moved to.
+//! A base that can move sideways drives straight to the goal and turns at the same time. Any
+//! other base turns toward the goal, drives to it, and turns to the heading there. The velocity
+//! depends only on the pose and on whether the goal was reached before. A base that was moved
+//! therefore continues from its new pose.
 
 use crate::base_verdict::FloorPose;
 use drivers::base_motion::{BaseLimits, BaseVelocity};
 use std::f64::consts::PI;
 
-/// Distance at which a base is at its goal, meters, and from which it is there no more. A pose from
-/// a localization has noise of this size.
+/// A base reaches its goal within the first distance, and leaves it beyond the second one, meters.
+/// Localization has noise of this size.
 const AT_GOAL_M: f64 = 0.03;
 const LEFT_GOAL_M: f64 = 0.08;
 /// The same for the heading.
 const AT_HEADING_RAD: f64 = 0.03;
-/// Fraction of the acceleration that the way to the goal uses, so that the base can decelerate a
-/// little later than planned.
+/// Fraction of the acceleration limit with which the base slows down before the goal. The rest is
+/// a reserve for decelerating later than planned.
 const DECELERATION_FRAC: f64 = 0.5;
 /// Close to the goal, the speed is the distance divided by this time, seconds. It is longer than
 /// the delay from the pose to the motion of the base, so the base does not swing around the goal.
 const SETTLE_SECS: f64 = 0.6;
-/// Direction of the goal beyond which a base that cannot move sideways only turns.
+/// Bearing of the goal, radians, beyond which a base that cannot move sideways only turns.
 const TURN_ONLY_RAD: f64 = 0.35;
 
-/// The next velocity on the way to a goal.
+/// The next velocity toward a goal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct GoalStep {
     pub(crate) velocity: BaseVelocity,
@@ -89,8 +90,8 @@ pub(crate) fn toward(
     }
 }
 
-/// Speed at a distance from the goal: it can still be decelerated to zero, and becomes proportional
-/// to the distance close to the goal.
+/// Speed at a distance from the goal. From this speed, the base can decelerate to zero. Close to
+/// the goal, the speed is proportional to the distance.
 fn pace(distance: f64, max_speed: f64, acceleration: f64) -> f64 {
     let decelerated = (2.0 * DECELERATION_FRAC * acceleration * distance).sqrt();
     max_speed.min(decelerated).min(distance / SETTLE_SECS)

@@ -11,7 +11,7 @@ use std::collections::VecDeque;
 /// Number of entries that are kept if nobody takes them: a minute at 100 Hz.
 const MAX_ENTRIES: usize = 6000;
 
-/// One input of the chain, and what the chain decided.
+/// One input of the chain, and its decision.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum BaseEntry {
     /// A request of an operator.

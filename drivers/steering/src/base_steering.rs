@@ -27,14 +27,14 @@ pub struct BaseSteeringConfig {
     pub clutch: ClutchConfig,
     /// How fast the base may move.
     pub limits: BaseLimits,
-    /// The rectangle on the floor in which the base link stays: smallest x and y, then largest x and
-    /// y, in the world, meters. `None` for no bound.
+    /// The rectangle on the floor in which the base link stays: smallest x and y, then largest x
+    /// and y, in the world, meters. `None` for no bound.
     pub area_m: Option<[f64; 4]>,
     /// Where the arm on the base must be while the base moves; `None` without an arm.
     pub stowed: Option<Stowed>,
     /// How long a base follows a target without a newer one.
     pub target_expiry_secs: f64,
-    /// Age of the base's report from which it must brake.
+    /// Age of the newest report of the base above which the base must brake.
     pub max_base_silence_secs: f64,
     /// Greatest age of the pose of the base and of the posture of the arm.
     pub max_pose_age_secs: f64,
@@ -90,8 +90,8 @@ impl BaseSteeringConfig {
     }
 }
 
-/// Decides what a base does, from the requests of operators and from what is known about the base
-/// and the arm on it.
+/// Decides about the motion of a base, from the requests of operators and from the state of the
+/// base and the arm on it.
 ///
 /// It has no clock and no threads: every function takes the time, on one monotonic clock. The same
 /// calls give the same decisions, bit for bit.
@@ -218,7 +218,7 @@ impl BaseSteering {
         self.authority.stop().map(|(_, reason)| reason)
     }
 
-    /// Why the base was stopped since, if it was stopped again for another reason.
+    /// The newest reason, if the base was stopped again for another reason.
     pub fn newest_stop(&self) -> Option<&Reason> {
         self.authority.newest_stop()
     }
@@ -261,8 +261,8 @@ impl BaseSteering {
         verdict
     }
 
-    /// Takes the entries since the last call, and the number of older ones that were dropped because
-    /// this function was called too rarely.
+    /// Takes the entries since the last call, and the number of older ones that were dropped
+    /// because this function was called too rarely.
     pub fn take_record(&mut self) -> (Vec<BaseEntry>, u64) {
         self.record.take()
     }
@@ -388,7 +388,8 @@ impl BaseSteering {
             // A grip that follows another one whose release was lost also waits for rest.
             None if !base.is_at_rest => Err((Link::Base, Reason::BaseStillBraking)),
             None => {
-                // A base that lived longer than this chain has braked after higher numbers.
+                // A base that was opened before this chain may have ended motions with higher
+                // numbers.
                 self.n_motions = self.n_motions.max(base.braked_motion) + 1;
                 Ok(Motion {
                     grip,
@@ -470,7 +471,8 @@ impl BaseSteering {
                 motion: self.n_motions,
                 serial: self.n_targets,
                 velocity,
-                // The base's thread also notices a silent device, if this chain does not run.
+                // If this chain does not run, the base's thread also brakes when the device is
+                // silent.
                 expires_at: self
                     .authority
                     .deadline()

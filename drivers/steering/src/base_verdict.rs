@@ -1,4 +1,4 @@
-//! What is known about a base in one cycle, and what was decided.
+//! Inputs of one cycle of a base, and the decision.
 
 use crate::reason::Limit;
 use drivers::base_motion::{BaseOutput, BaseState, BaseTarget};
@@ -51,10 +51,10 @@ pub struct SeenPosture {
     pub position: Vec<f64>,
 }
 
-/// What is known about a base and the arm on it.
+/// State of a base and of the arm on it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BaseSituation {
-    /// What the base reports.
+    /// The newest report of the base.
     pub base: BaseState,
     /// Its pose; `None` if it is not known.
     pub pose: Option<SeenPose>,

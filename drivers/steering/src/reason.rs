@@ -55,8 +55,8 @@ impl std::fmt::Display for Limit {
     }
 }
 
-/// A reason in words. Places are points in the frame of the arm's base, in meters; those of a base
-/// are in the world.
+/// A reason in words. Places are points in the frame of the arm's base, in meters; for reasons
+/// of a base, they are in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, thiserror::Error)]
 pub enum Reason {
     /// Nobody holds the lease.
@@ -320,8 +320,8 @@ pub enum Reason {
         /// Time since the last report.
         silent_secs: f64,
     },
-    /// The base did not obey a velocity.
-    #[error("the base did not obey: {report}")]
+    /// The base refused a velocity.
+    #[error("the base refused the velocity: {report}")]
     BaseRefused {
         /// Report of the base.
         report: String,
@@ -372,8 +372,8 @@ pub enum Reason {
 }
 
 impl Reason {
-    /// The place of the reason in the frame of the arm's base, or in the world for reasons of a base,
-    /// meters.
+    /// The place of the reason in the frame of the arm's base, or in the world for reasons of a
+    /// base, meters.
     pub fn place(&self) -> Option<[f64; 3]> {
         match self {
             Self::PartSpeed { place, .. }

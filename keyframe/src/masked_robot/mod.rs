@@ -92,7 +92,7 @@ impl MaskedRobot {
     /// The same robot in the frame of a corrected camera. The hidden pixels stay the same.
     ///
     /// * `corrected_from_camera`: pose of the uncorrected camera in the frame of the corrected one.
-    /// * `depth_correction`: is multiplied to `camera_from_depth` from the left.
+    /// * `depth_correction`: `camera_from_depth` is multiplied by it from the left.
     #[must_use]
     pub fn seen_by_corrected(
         &self,

@@ -206,7 +206,7 @@ impl RunPlan {
                 },
                 Some(folder),
             ) => Err(BadInput(format!(
-                "{}: a run that waits for the trainer continues with `{}`; {} {} continues a run in real time",
+                "{}: a run that waits for the trainer continues with `{}`; {} with {} continues only runs in real time",
                 Setting::Resume,
                 self.resume_command().line(folder),
                 Setting::From,
@@ -216,8 +216,8 @@ impl RunPlan {
         }
     }
 
-    /// Checks that a recording can be written. It may be in the folder of the results, which the run
-    /// makes.
+    /// Checks that a recording can be written. It may be in the folder of the results, which the
+    /// run makes.
     fn check_record(&self, file: &Path) -> Result<(), BadInput> {
         let is_in_out = self.out.as_deref().is_some_and(|out| file.starts_with(out));
         if is_in_out {
@@ -386,7 +386,8 @@ impl RunPlan {
         }
     }
 
-    /// Name of the rig file without its extension. Without a rig file, that of the recording.
+    /// Name of the rig file without its extension. Without a rig file, name of the recording
+    /// without its extension.
     fn rig_name(&self) -> String {
         let file = self.rig_file.as_deref().or_else(|| self.recording());
         let name = file.map(|file| file.file_stem().unwrap_or(file.as_os_str()));

@@ -1,4 +1,4 @@
-//! What operators of a run steer: its arm or its base.
+//! The robot that operators of a run steer: its arm or its base.
 
 use super::base::PreparedBase;
 use super::{ClearanceFeed, PreparedSteering, SteeringThread};

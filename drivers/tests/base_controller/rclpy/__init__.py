@@ -1,5 +1,5 @@
-"""The part of rclpy that ros2_drive.py uses. The robot has the velocity that was published last at once, and its odometry
-reports it. Nothing is published before the first command."""
+"""The part of rclpy that ros2_drive.py uses. The robot reaches the last published velocity immediately, and its
+odometry reports it. Nothing is published before the first command."""
 
 import time
 

@@ -1,6 +1,6 @@
-//! One cycle of the loop that steers a base: takes the requests of clients, decides what the base
-//! does, and says what clients should know. It has no thread and no clock, so that tests can set the
-//! time.
+//! One cycle of the loop that steers a base: takes the requests of clients, decides about the
+//! motion of the base, and returns the state for clients. It has no thread and no clock, so that
+//! tests can set the time.
 
 use super::robot_watch::SeenRobot;
 use crate::steering::requests;
@@ -83,7 +83,7 @@ impl BaseLoop {
         self.log = Some(log);
     }
 
-    /// Takes the requests, and decides what the base does.
+    /// Takes the requests, and decides about the motion of the base.
     pub(super) fn cycle(
         &mut self,
         now: Stamp,
@@ -124,7 +124,7 @@ impl BaseLoop {
         }
     }
 
-    /// What is known about the robot. A base that has never reported counts as silent since the first
+    /// The state of the robot. A base that has never reported counts as silent since the first
     /// cycle.
     fn situation(&mut self, now: Stamp, seen: &SeenRobot) -> BaseSituation {
         let began_at = *self.began_at.get_or_insert(now);
@@ -164,13 +164,13 @@ impl BaseLoop {
             },
             SteeringRequest::Command(command) => return self.command(now, received, command),
             SteeringRequest::Preview(_) => {
-                return Err("a base has no previews: its goals are in the area or not".to_owned());
+                return Err("a base has no previews: send the goal as a command".to_owned());
             }
             SteeringRequest::View { world_from_camera } => {
                 self.see(now, operator, *world_from_camera);
                 return Ok(());
             }
-            // Whoever has gone cannot open a dead-man switch any more.
+            // A client that has disconnected cannot open a dead-man switch any more.
             SteeringRequest::Disconnected if self.holds_lease(operator) => {
                 Request::ReleaseLease(operator)
             }

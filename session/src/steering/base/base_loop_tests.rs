@@ -31,7 +31,7 @@ const LIMITS: BaseLimits = BaseLimits {
     brake_yaw_rad_s2: 4.0,
 };
 
-/// A base that has every velocity at once.
+/// A base that reaches every velocity immediately.
 #[derive(Clone, Default)]
 struct IdealBase(Arc<Mutex<BaseVelocity>>);
 

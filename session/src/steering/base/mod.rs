@@ -1,9 +1,9 @@
 //! Lets operators drive the base of a run.
 //!
-//! A separate thread takes the requests of the clients of `/steer`, decides with the chain of the
-//! crate `steering` what the base does, and sends it to the base's own thread, which brakes as soon
-//! as targets expire. `base_loop.rs` has one cycle, and `robot_watch.rs` what the devices of the run
-//! report about the robot.
+//! A separate thread takes the requests of the clients of `/steer`, and decides about the motion of
+//! the base with the chain of the crate `steering`. It sends the decision to the base's own thread,
+//! which brakes as soon as targets expire. `base_loop.rs` contains one cycle. `robot_watch.rs`
+//! stores the newest reports of the devices of the run about the robot.
 
 mod base_loop;
 #[cfg(test)]
@@ -52,8 +52,8 @@ impl PreparedBase {
         }
     }
 
-    /// An observer of the run's input, from which the pose of the base and the posture of its arm are
-    /// known. It also passes everything on to viewers.
+    /// An observer of the run's input, from which the pose of the base and the posture of its arm
+    /// are known. It also passes everything on to viewers.
     pub(crate) fn observer(&self, viewers: Viewers) -> Box<dyn InputObserver> {
         Box::new(WatchingObserver::new(viewers, Arc::clone(&self.watch)))
     }
@@ -134,7 +134,7 @@ fn config(base: &SteeredBase, rig: &Rig) -> BaseSteeringConfig {
     }
 }
 
-/// What the thread owns.
+/// Data of the thread.
 struct Running {
     base_loop: BaseLoop,
     base: SteeredBase,

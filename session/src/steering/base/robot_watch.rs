@@ -1,4 +1,4 @@
-//! What the devices of a run report about a robot: the pose of its base, and the posture of its arm.
+//! The newest reports of the devices of a run: the pose of the base, and the posture of the arm.
 
 use super::pose_tracker::PoseTracker;
 use crate::steering::time_base::TimeBase;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use steering::{FloorPose, SeenPose, SeenPosture};
 use viz::{LiveImage, RangeScan, RobotState};
 
-/// What is known about a robot besides the report of its base.
+/// State of a robot besides the report of its base.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct SeenRobot {
     /// Pose of the base link on the floor.
@@ -51,8 +51,8 @@ impl RobotWatch {
         self.times
     }
 
-    /// The newest state: that of the devices themselves if they report it, because the input of the
-    /// run waits for a busy trainer.
+    /// The newest state. Reports of the devices themselves come first, because the input of the run
+    /// waits for a busy trainer.
     pub(super) fn seen(&self) -> SeenRobot {
         let newest = self.newest.lock();
         let reported = newest.poses.newest();
@@ -137,7 +137,7 @@ impl InputObserver for WatchingObserver {
     }
 
     fn needs_robot(&self) -> bool {
-        // The pose of the base is needed, also if nobody watches.
+        // The pose of the base is needed, also without viewers.
         true
     }
 

@@ -125,7 +125,7 @@ struct History {
     target: Option<Vec<f64>>,
     /// The last decision; `None` before the first, and after missing entries.
     decided: Option<Decided>,
-    /// Whether the log is that of a base.
+    /// Whether the log belongs to a base.
     is_base: bool,
     /// Its pose.
     world_from_base: Option<[f64; 7]>,
@@ -141,7 +141,7 @@ struct History {
     episodes: Vec<(Episode, Stamp)>,
 }
 
-/// What matters of a decision.
+/// The parts of a decision from which incidents follow.
 struct Decided {
     limits: Vec<Limit>,
     /// Whether the robot followed an operator.

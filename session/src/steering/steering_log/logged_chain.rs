@@ -1,4 +1,4 @@
-//! The chains of decisions whose entries are logged: that of an arm, and that of a base.
+//! The chains of decisions whose entries are logged: the chain of an arm, and the chain of a base.
 
 use super::line::{BaseStart, Line, Start, VERSION};
 use drivers::base_motion::BaseOutput;
@@ -13,11 +13,11 @@ use steering::{
 pub(in crate::steering) trait LoggedChain {
     /// All that the chain remembers.
     type State;
-    /// One input, and what was decided.
+    /// One input, and the decision.
     type Entry;
     /// The decision of one cycle.
     type Verdict: Clone + PartialEq;
-    /// What a log contains besides decisions.
+    /// Content of a log besides decisions.
     type About;
 
     /// The state now.
@@ -41,7 +41,7 @@ pub(in crate::steering) trait LoggedChain {
     fn are_equal_except_times(a: &Self::State, b: &Self::State) -> bool;
 }
 
-/// What matters of a cycle for its log.
+/// The parts of a cycle on which its log depends.
 pub(in crate::steering) struct LoggedCycle<'a, V> {
     pub(in crate::steering) verdict: &'a V,
     /// Whether the robot must be at rest.

@@ -214,8 +214,8 @@ export function placeText([x, y, z]: readonly [number, number, number]): string 
 }
 
 /**
- * The direction, to 5 degrees, as text, such as "turn right 40 degrees, 0.6 m higher, 1.3 m away". The last two say where
- * the place is: many cameras cannot move up and down.
+ * The direction, to 5 degrees, as text, such as "turn right 40 degrees, 0.6 m higher, 1.3 m away". The last two give
+ * the position: many cameras cannot move up and down.
  */
 export function directionText({ rightRad, upM, distanceM }: Direction): string {
   const parts: string[] = [];

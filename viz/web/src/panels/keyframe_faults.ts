@@ -48,7 +48,7 @@ function pixelFaults(errors: KeyframeErrors, { turnRadS }: KeyframeFacts): strin
   const faults: string[] = [];
   const isBlurred = detailRatio !== null && detailRatio < BLURRED_RATIO;
   if (shiftPx) faults.push(`shifted by ${shiftText(shiftPx)}: the pose or the time offset may be wrong`);
-  // Blur changes the picture most where the scene has the most detail. Nothing has moved there.
+  // Blur changes the picture most where the scene has the most detail. The error is then no sign of motion.
   if (worst) faults.push(`large error in the ${worst.name}${isBlurred ? "" : ": did something move there?"}`);
   if (isBlurred) {
     const isFast = turnRadS !== null && turnRadS > FAST_TURN_RAD_S;

@@ -79,7 +79,7 @@ export class Commander {
   /** The hand of the gizmo: where it is, and where the pointer wants it. */
   private hand: { now: Pose; wanted: Pose } | null = null;
   private goIntent: Intent | null = null;
-  /** Where a base should go: x, y and heading in the world. */
+  /** The goal of a base: x, y and heading in the world. */
   private floorGoal: Point | null = null;
   /** Whether the base has been at this goal. */
   private hasArrived = false;
@@ -217,7 +217,7 @@ export class Commander {
       this.goIntent = null;
       this.goal.clear();
     }
-    // After the release, a goal that was reached is done.
+    // A goal that was reached is removed after the release.
     if (state.base?.has_arrived) this.hasArrived = true;
     else if (this.hasArrived && this.deadMan.source === null) this.setBaseGoal(null);
   }
@@ -295,7 +295,7 @@ export class Commander {
     if (this.maySteer) this.setGoal({ kind: "joints", position: [...position] });
   }
 
-  /** Sets where the base should go; null for nowhere. */
+  /** Sets the goal of the base; null removes it. */
   setBaseGoal(goal: Point | null): void {
     if (this.deadMan.source === "go" || this.deadMan.source === "pad go") this.deadMan.open("the goal has changed");
     this.floorGoal = goal;

@@ -1,4 +1,4 @@
-// The goal of a base on the floor: where it is placed, which way it faces, and whether it can be sent. This file has no DOM.
+// The goal of a base on the floor: its position and heading, and whether it can be sent. This file has no DOM.
 
 import type { Area, Intent, Point } from "./messages";
 

@@ -8,7 +8,7 @@ import type { ArmJoint } from "./messages";
 import { type Deflection, NO_DEFLECTION } from "./jog";
 import { jointText } from "./texts";
 
-/** Directions that a base has, too. */
+/** Directions in which a base can also be jogged. */
 const ON_FLOOR: readonly (keyof Deflection)[] = ["right", "forward", "yaw"];
 
 /** Pairs of directions: the names of both, and the deflection of the first. */

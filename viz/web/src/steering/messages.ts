@@ -48,7 +48,7 @@ export interface ArmJoint {
 
 /** A base that is driven. */
 export interface SteeredBase {
-  /** Largest speeds, m/s and rad/s. Sideways, it is 0 for a base that cannot move there. */
+  /** Largest speeds, m/s and rad/s. `max_left_m_s` is 0 for a base that cannot move sideways. */
   max_forward_m_s: number;
   max_left_m_s: number;
   max_yaw_rad_s: number;

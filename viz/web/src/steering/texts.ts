@@ -3,7 +3,7 @@
 import type { Limit, SteerState, Verdict } from "./messages";
 import type { Mode } from "./round_trip";
 
-/** Who has control, from the view of one client. `robot` is what is steered. */
+/** Who has control, from the view of one client. `robot` names the steered part of the robot. */
 export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number, robot = "arm"): string {
   if (holder === null) return `Nobody has control of the ${robot}`;
   if (holder === client) {
@@ -36,7 +36,7 @@ export function baseText(roundTripMillis: number | null): string {
   return `The base moves while you hold (${measured})`;
 }
 
-/** What a goal of a base needs. */
+/** State of a goal of a base, and what the operator must do. */
 export function baseGoalText(hasArrived: boolean, mayGo: boolean): string {
   if (!mayGo) return "The goal is outside the area of the base";
   return hasArrived ? "The base is at the goal" : "Hold Go until the base is there";

@@ -85,7 +85,7 @@ export class OrbitView {
   private hasAskedForOverview = false;
   /** Distance of the robot from the eye of the overview if the model hides it, meters; otherwise null. */
   private hiddenRobotM: number | null = null;
-  /** Whether the overview cuts away what hides the robot, until the user shows the whole model again. */
+  /** Whether the overview cuts away surfaces that hide the robot. False after the user has shown the whole model again. */
   private mayCutForRobot = true;
   private isStale = true;
   private isModelShown = true;
