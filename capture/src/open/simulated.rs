@@ -59,14 +59,15 @@ pub(super) fn steered(
     Ok((Box::new(RealTime::new(rig, live, start)?), arm))
 }
 
+/// A simulated base, and the same base for the thread that drives it.
+pub(super) type DrivenBase = (sim::SteeredBase, Box<dyn MovableBase>);
+
 /// Opens a simulated rig in real time, with a base that an operator may take over from its tour.
-/// Also returns the base for the thread that drives it. Stamps are on the clock of this computer.
-pub(super) fn with_steered_base(
-    rig: &Rig,
-) -> anyhow::Result<(Box<dyn Source>, sim::SteeredBase, Box<dyn MovableBase>)> {
+/// Stamps are on the clock of this computer.
+pub(super) fn with_steered_base(rig: &Rig) -> anyhow::Result<(Box<dyn Source>, DrivenBase)> {
     let opened = sim::open(&without_end(config_of(rig)?))?.into_steered_base()?;
     let source = RealTime::new(rig, opened.live, opened.start)?;
-    Ok((Box::new(source), opened.base, opened.driven))
+    Ok((Box::new(source), (opened.base, opened.driven)))
 }
 
 /// A configuration without limits. In real time, the source checks them itself: if the simulated

@@ -146,7 +146,7 @@ fn open_simulated(
     rig: &Rig,
     motion: &BaseMotion,
 ) -> anyhow::Result<(Box<dyn Source>, SteeredBase)> {
-    let (source, base, driven) = super::simulated::with_steered_base(rig)?;
+    let (source, (base, driven)) = super::simulated::with_steered_base(rig)?;
     let base = SteeredBase {
         drive: BaseDrive::start(driven, motion.limits())?,
         tap: RobotTap::default(),
