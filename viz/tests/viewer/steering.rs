@@ -107,6 +107,7 @@ fn a_client_learns_the_arm_and_its_own_number_first() {
     let number_of_page = page.text()["client"].as_u64().expect("a number");
     let first = desk.client();
     let expected = json!({
+        "base": null,
         "type": "arm", "client": first.number(), "may_steer": true,
         "base_link": "base", "tip_link": "tool",
         "joints": [
@@ -284,7 +285,7 @@ fn states_have_all_fields_on_the_servers_clock() {
             "text": "the elbow is 20 mm from the base", "place": [0.0, 0.5, 1.0],
         }],
         "applied": {"device": 1, "sequence": 4, "captured_micros": null, "applied_micros": null},
-        "contacts": 3, "clients": [{"id": client.number(), "role": "operator"}],
+        "contacts": 3, "clients": [{"id": client.number(), "role": "operator"}], "base": null,
     });
     assert_eq!(message, expected);
 }
