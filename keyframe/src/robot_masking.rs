@@ -292,7 +292,7 @@ mod tests {
         again.mask_robot(robot(), &views);
         assert!(Arc::ptr_eq(&before.rgba_srgb, &again.rgba_srgb));
         assert!(Arc::ptr_eq(readings(&before), readings(&again)));
-        // A keyframe whose pixels were dropped stays as it is.
+        // A keyframe without pixels is not changed.
         let mut empty = Keyframe {
             rgba_srgb: [].into(),
             ..before

@@ -8,6 +8,7 @@
 
 mod base;
 mod clearance_feed;
+mod followed_command;
 mod joint_map;
 mod observer;
 mod prepared_robot;
@@ -85,7 +86,7 @@ impl PreparedSteering {
     /// An observer of the run's input, from which the free space around the arm is known. It also
     /// passes everything on to viewers.
     pub(crate) fn observer(&self, viewers: Viewers) -> SteeringObserver {
-        SteeringObserver::new(viewers, Arc::clone(&self.scene))
+        SteeringObserver::new(viewers, Arc::<SceneClearance>::clone(&self.scene))
     }
 
     /// Passes depth that the live model draws to the map of free space.

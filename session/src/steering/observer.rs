@@ -1,4 +1,4 @@
-//! Passes what the devices of a run deliver to the map of free space, and to viewers.
+//! Passes the data of the devices of a run to the steering of a robot, and to viewers.
 
 use super::scene_clearance::SceneClearance;
 use crate::viewers::Viewers;
@@ -7,15 +7,34 @@ use keyframe::Keyframe;
 use std::sync::Arc;
 use viz::{LiveImage, RangeScan, RobotState};
 
-/// An observer of a run's input whose arm is steered.
+/// A part of steering that needs the data of the devices.
+pub(super) trait RobotObserver: Send + Sync {
+    /// Receives a state of the robot.
+    fn observe_robot(&self, state: &RobotState);
+
+    /// Receives a keyframe when it is accepted.
+    fn observe_keyframe(&self, _keyframe: &Arc<Keyframe>) {}
+}
+
+impl RobotObserver for SceneClearance {
+    fn observe_robot(&self, state: &RobotState) {
+        SceneClearance::observe_robot(self, state);
+    }
+
+    fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
+        SceneClearance::observe_keyframe(self, keyframe);
+    }
+}
+
+/// An observer of a run's input whose robot is steered.
 pub(crate) struct SteeringObserver {
     viewers: Viewers,
-    scene: Arc<SceneClearance>,
+    robot: Arc<dyn RobotObserver>,
 }
 
 impl SteeringObserver {
-    pub(super) fn new(viewers: Viewers, scene: Arc<SceneClearance>) -> Self {
-        Self { viewers, scene }
+    pub(super) fn new(viewers: Viewers, robot: Arc<dyn RobotObserver>) -> Self {
+        Self { viewers, robot }
     }
 }
 
@@ -29,19 +48,20 @@ impl InputObserver for SteeringObserver {
     }
 
     fn needs_robot(&self) -> bool {
-        // The posture at the time of each keyframe is needed, also if nobody watches.
+        // Steering needs the poses and postures, also if nobody watches.
         true
     }
 
     fn observe_robot(&self, state: RobotState) {
-        self.scene.observe_robot(&state);
+        self.robot.observe_robot(&state);
         if self.viewers.needs_robot() {
             self.viewers.observe_robot(state);
         }
     }
 
     fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
-        self.scene.observe_keyframe(keyframe);
+        self.robot.observe_keyframe(keyframe);
+        self.viewers.observe_keyframe(keyframe);
     }
 
     fn observe_range_scan(&self, scan: RangeScan) {

@@ -1,6 +1,7 @@
 //! One cycle of the steering loop: takes the requests of clients, decides what the arm does, and
 //! says what clients should know. It has no thread and no clock, so that tests can set the time.
 
+use super::followed_command::{FollowedCommand, stop_text};
 use super::joint_map::JointMap;
 use super::previews::{Now, Previews};
 use super::recovery::{Permission, Recovery};
@@ -12,14 +13,13 @@ use kinematics::inverse::InverseSolver;
 use kinematics::{Chain, Stamp, transform};
 use std::collections::VecDeque;
 use std::path::Path;
-use std::time::Instant;
 use steering::{
     Body, Clearance, NearestPosture, Operator, Reason, Request, Robot, Steering, SteeringConfig,
     Verdict,
 };
 use viz::{
-    AppliedCommand, Preview, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand,
-    SteeringRequest, SteeringState,
+    Preview, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand, SteeringRequest,
+    SteeringState,
 };
 
 /// Maximum number of goals that wait to be checked. The server keeps one per client.
@@ -49,18 +49,8 @@ pub(super) struct SteeringLoop {
     times: TimeBase,
     /// Whether an operator has had the lease. Nothing is sent to the arm before.
     has_begun: bool,
-    /// The newest command that moves the arm, until a cycle has applied it.
-    pending: Option<AppliedSource>,
-    applied: Option<AppliedCommand>,
+    followed: FollowedCommand,
     log: Option<LoopLog>,
-}
-
-/// Where a setpoint comes from.
-#[derive(Clone, Copy, Debug)]
-struct AppliedSource {
-    device: u64,
-    sequence: u64,
-    captured_at: Instant,
 }
 
 /// Results of a cycle.
@@ -135,8 +125,7 @@ impl SteeringLoop {
             port,
             times,
             has_begun: false,
-            pending: None,
-            applied: None,
+            followed: FollowedCommand::default(),
             log: None,
         })
     }
@@ -183,7 +172,8 @@ impl SteeringLoop {
         if let Some(log) = &mut self.log {
             log.take(now, &mut self.steering);
         }
-        self.note_applied(now, &verdict);
+        self.followed
+            .note_cycle(verdict.target().is_some(), self.times.instant(now));
         // A goal out of reach takes longer than a cycle. While the arm follows an operator, the next
         // decision must not wait for it.
         if verdict.target().is_none() {
@@ -300,13 +290,7 @@ impl SteeringLoop {
         let n_joints = self.chain.n_joints();
         let converted = requests::command(received, command, self.times, n_joints);
         self.handle(now, &Request::Command(converted))?;
-        if command.grip.is_some() {
-            self.pending = Some(AppliedSource {
-                device: command.device,
-                sequence: command.sequence,
-                captured_at: command.captured_at,
-            });
-        }
+        self.followed.receive(command);
         Ok(())
     }
 
@@ -370,33 +354,6 @@ impl SteeringLoop {
             .push((client, Reply::Preview(request.id, preview)));
     }
 
-    /// Notes which command the arm follows.
-    fn note_applied(&mut self, now: Stamp, verdict: &Verdict) {
-        if verdict.target().is_none() {
-            self.pending = None;
-            self.applied = None;
-            return;
-        }
-        if let Some(source) = self.pending.take() {
-            self.applied = Some(AppliedCommand {
-                device: source.device,
-                sequence: source.sequence,
-                captured_at: source.captured_at,
-                applied_at: self.times.instant(now),
-            });
-        }
-    }
-
-    /// Why the arm is stopped: the first reason, because it is the cause, and the newest, because
-    /// operators must see that their own stop has arrived, for example during a recovery.
-    fn stop(&self) -> Option<String> {
-        let first = self.steering.stop()?;
-        Some(match self.steering.newest_stop() {
-            Some(newest) => format!("{first}; since then: {newest}"),
-            None => first.to_string(),
-        })
-    }
-
     /// The state for clients; `None` if the arm's report has no pose.
     fn state(&self, now: Stamp, arm: &ArmState, verdict: &Verdict) -> Option<SteeringState> {
         let pose_at = |q: &[f64]| Some(transform::to_xyz_xyzw(&self.chain.forward(q).ok()?));
@@ -406,7 +363,7 @@ impl SteeringLoop {
             holder: self.steering.holder().map(|(holder, _)| holder.0),
             lease_left_secs: self.steering.lease_left_secs(now),
             offered_to: self.steering.offered_to(now).map(|operator| operator.0),
-            stop: self.stop(),
+            stop: stop_text(self.steering.stop(), self.steering.newest_stop()),
             stop_number: self.steering.stop().map(|_| self.steering.stop_number()),
             is_recovering: self.recovery.is_running(),
             is_moving: !arm.is_at_rest,
@@ -415,7 +372,7 @@ impl SteeringLoop {
             position: arm.position.clone(),
             target,
             limits: verdict.limits.iter().map(requests::applied_limit).collect(),
-            applied: self.applied,
+            applied: self.followed.applied(),
             contacts: None,
             base: None,
         })

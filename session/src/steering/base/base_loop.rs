@@ -3,18 +3,18 @@
 //! tests can set the time.
 
 use super::robot_watch::SeenRobot;
+use crate::steering::followed_command::{FollowedCommand, stop_text};
 use crate::steering::requests;
 use crate::steering::steering_log::LoopLog;
 use crate::steering::time_base::TimeBase;
 use drivers::base_motion::{BaseOutput, BasePort, BaseState, BaseVelocity};
 use kinematics::{Stamp, Transform, transform};
-use std::time::Instant;
 use steering::{
     BaseSituation, BaseSteering, BaseSteeringConfig, BaseVerdict, Error, Operator, Request,
 };
 use viz::{
-    AppliedCommand, ReceivedRequest, RefusedRequest, SteeredBaseState, SteeringCommand,
-    SteeringRequest, SteeringState,
+    ReceivedRequest, RefusedRequest, SteeredBaseState, SteeringCommand, SteeringRequest,
+    SteeringState,
 };
 
 /// The state of the loop between two cycles.
@@ -26,18 +26,8 @@ pub(super) struct BaseLoop {
     began_at: Option<Stamp>,
     /// Whether an operator has had the lease. Nothing is sent to the base before.
     has_begun: bool,
-    /// The newest command that moves the base, until a cycle has applied it.
-    pending: Option<AppliedSource>,
-    applied: Option<AppliedCommand>,
+    followed: FollowedCommand,
     log: Option<LoopLog<BaseSteering>>,
-}
-
-/// Where a velocity comes from.
-#[derive(Clone, Copy, Debug)]
-struct AppliedSource {
-    device: u64,
-    sequence: u64,
-    captured_at: Instant,
 }
 
 /// Results of a cycle.
@@ -67,8 +57,7 @@ impl BaseLoop {
             times,
             began_at: None,
             has_begun: false,
-            pending: None,
-            applied: None,
+            followed: FollowedCommand::default(),
             log: None,
         })
     }
@@ -109,7 +98,8 @@ impl BaseLoop {
         if let Some(log) = &mut self.log {
             log.take(now, &mut self.steering);
         }
-        self.note_applied(now, &verdict);
+        self.followed
+            .note_cycle(verdict.target().is_some(), self.times.instant(now));
         BaseOutcome {
             refusals,
             ends_tour,
@@ -206,41 +196,8 @@ impl BaseLoop {
     ) -> Result<(), String> {
         let converted = requests::command(received, command, self.times, 0);
         self.handle(now, &Request::Command(converted))?;
-        if command.grip.is_some() {
-            self.pending = Some(AppliedSource {
-                device: command.device,
-                sequence: command.sequence,
-                captured_at: command.captured_at,
-            });
-        }
+        self.followed.receive(command);
         Ok(())
-    }
-
-    /// Notes which command the base follows.
-    fn note_applied(&mut self, now: Stamp, verdict: &BaseVerdict) {
-        if verdict.target().is_none() {
-            self.pending = None;
-            self.applied = None;
-            return;
-        }
-        if let Some(source) = self.pending.take() {
-            self.applied = Some(AppliedCommand {
-                device: source.device,
-                sequence: source.sequence,
-                captured_at: source.captured_at,
-                applied_at: self.times.instant(now),
-            });
-        }
-    }
-
-    /// Why the base is stopped: the first reason, because it is the cause, and the newest, because
-    /// operators must see that their own stop has arrived.
-    fn stop(&self) -> Option<String> {
-        let first = self.steering.stop()?;
-        Some(match self.steering.newest_stop() {
-            Some(newest) => format!("{first}; since then: {newest}"),
-            None => first.to_string(),
-        })
     }
 
     fn state(&self, now: Stamp, situation: &BaseSituation, verdict: &BaseVerdict) -> SteeringState {
@@ -252,7 +209,7 @@ impl BaseLoop {
             holder: self.steering.holder().map(|(holder, _)| holder.0),
             lease_left_secs: self.steering.lease_left_secs(now),
             offered_to: self.steering.offered_to(now).map(|operator| operator.0),
-            stop: self.stop(),
+            stop: stop_text(self.steering.stop(), self.steering.newest_stop()),
             stop_number: self.steering.stop().map(|_| self.steering.stop_number()),
             is_recovering: false,
             is_moving: !base.is_at_rest,
@@ -262,7 +219,7 @@ impl BaseLoop {
             base_from_tip: transform::to_xyz_xyzw(&Transform::identity()),
             base_from_target: None,
             limits: verdict.limits.iter().map(requests::applied_limit).collect(),
-            applied: self.applied,
+            applied: self.followed.applied(),
             contacts: None,
             base: Some(SteeredBaseState {
                 world_from_base: pose.map(|pose| [pose.x_m, pose.y_m, pose.yaw_rad]),

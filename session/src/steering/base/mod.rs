@@ -11,6 +11,7 @@ mod base_loop_tests;
 mod pose_tracker;
 mod robot_watch;
 
+use super::observer::SteeringObserver;
 use super::steering_log::LoopLog;
 use super::time_base::TimeBase;
 use super::{Admission, MIN_PERIOD, PERIOD, SteeringThread};
@@ -20,7 +21,7 @@ use base_loop::BaseLoop;
 use capture::InputObserver;
 use capture::config::{ArmDriver, Rig};
 use capture::open::SteeredBase;
-use robot_watch::{RobotWatch, WatchingObserver};
+use robot_watch::RobotWatch;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -55,7 +56,10 @@ impl PreparedBase {
     /// An observer of the run's input, from which the pose of the base and the posture of its arm
     /// are known. It also passes everything on to viewers.
     pub(crate) fn observer(&self, viewers: Viewers) -> Box<dyn InputObserver> {
-        Box::new(WatchingObserver::new(viewers, Arc::clone(&self.watch)))
+        Box::new(SteeringObserver::new(
+            viewers,
+            Arc::<RobotWatch>::clone(&self.watch),
+        ))
     }
 
     /// Lets clients of the hub drive the base.

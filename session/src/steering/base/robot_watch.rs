@@ -1,16 +1,13 @@
 //! The newest reports of the devices of a run: the pose of the base, and the posture of the arm.
 
 use super::pose_tracker::PoseTracker;
+use crate::steering::observer::RobotObserver;
 use crate::steering::time_base::TimeBase;
-use crate::viewers::Viewers;
-use capture::InputObserver;
-use keyframe::Keyframe;
 use kinematics::{JointState, Stamp, Transform};
 use nalgebra::Vector3;
 use parking_lot::Mutex;
-use std::sync::Arc;
 use steering::{FloorPose, SeenPose, SeenPosture};
-use viz::{LiveImage, RangeScan, RobotState};
+use viz::RobotState;
 
 /// State of a robot besides the report of its base.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -115,45 +112,9 @@ pub(super) fn floor_pose(world_from_base: &Transform) -> FloorPose {
     }
 }
 
-/// An observer of a run's input whose base is steered.
-pub(super) struct WatchingObserver {
-    viewers: Viewers,
-    watch: Arc<RobotWatch>,
-}
-
-impl WatchingObserver {
-    pub(super) fn new(viewers: Viewers, watch: Arc<RobotWatch>) -> Self {
-        Self { viewers, watch }
-    }
-}
-
-impl InputObserver for WatchingObserver {
-    fn needs_images(&self) -> bool {
-        self.viewers.needs_images()
-    }
-
-    fn observe(&self, image: LiveImage) {
-        self.viewers.observe(image);
-    }
-
-    fn needs_robot(&self) -> bool {
-        // The pose of the base is needed, also without viewers.
-        true
-    }
-
-    fn observe_robot(&self, state: RobotState) {
-        self.watch.observe(&state);
-        if self.viewers.needs_robot() {
-            self.viewers.observe_robot(state);
-        }
-    }
-
-    fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
-        self.viewers.observe_keyframe(keyframe);
-    }
-
-    fn observe_range_scan(&self, scan: RangeScan) {
-        self.viewers.observe_range_scan(scan);
+impl RobotObserver for RobotWatch {
+    fn observe_robot(&self, state: &RobotState) {
+        self.observe(state);
     }
 }
 
