@@ -18,11 +18,11 @@ pub(super) trait RobotObserver: Send + Sync {
 
 impl RobotObserver for SceneClearance {
     fn observe_robot(&self, state: &RobotState) {
-        SceneClearance::observe_robot(self, state);
+        Self::observe_robot(self, state); // The function of the map itself.
     }
 
     fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
-        SceneClearance::observe_keyframe(self, keyframe);
+        Self::observe_keyframe(self, keyframe);
     }
 }
 
