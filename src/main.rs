@@ -14,6 +14,7 @@ mod flag_names;
 mod flag_tests;
 #[cfg(test)]
 mod guide_tests;
+mod named_args;
 mod number_args;
 mod open_gpu;
 mod page_args;

@@ -281,6 +281,18 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
 }
 
+/// Prints a value as JSON, or its lines of text.
+pub(crate) fn json_or_lines<T: Display>(
+    is_json: bool,
+    value: &impl Serialize,
+    texts: impl IntoIterator<Item = T>,
+) -> anyhow::Result<()> {
+    if is_json {
+        return json(value);
+    }
+    Ok(lines(texts)?)
+}
+
 /// Prints one JSON object on its own line, as [`report()`] does.
 ///
 /// # Errors

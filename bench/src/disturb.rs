@@ -53,6 +53,19 @@ impl Disturbance {
         }
     }
 
+    /// What is disturbed, and the range of the default sizes.
+    #[must_use]
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::PoseNoise => "Errors of training poses: 0 to 50 mm and 0 to 5 degrees",
+            Self::ClockOffset => "Poses from 0 to 200 ms after the image stamps",
+            Self::Exposure => {
+                "A sudden change of the exposure by 0 to 1 EV in the middle of the capture"
+            }
+            Self::Keyframes => "3 to 300 training keyframes",
+        }
+    }
+
     /// Axis label for the size, with its unit.
     pub(crate) fn axis(self) -> &'static str {
         match self {

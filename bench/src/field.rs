@@ -1,6 +1,6 @@
 //! Measures the training speed of a neural field.
 
-use crate::kernels::profile;
+use crate::kernels::{pass_lines, profile};
 use anyhow::{Context, Result};
 use messages::Setting;
 use serde::Serialize;
@@ -49,6 +49,24 @@ pub struct FieldRow {
     /// Names and milliseconds of the passes of a step, if requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub passes: Vec<(&'static str, f64)>,
+}
+
+impl FieldRow {
+    /// The row as text: the times, then a line for each pass.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let mut lines = vec![format!(
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering {:.3} ms, peak {} MB",
+            self.rays,
+            self.samples,
+            self.step_millis,
+            self.step_wall_millis,
+            self.colors_millis,
+            self.peak_bytes >> 20
+        )];
+        lines.extend(pass_lines(&self.passes));
+        lines
+    }
 }
 
 /// Measures a training step for each number of samples in turn.

@@ -17,6 +17,7 @@ const MIN_SPAN_SECS: f64 = 60.0;
 /// pairs, and 400 samples already have 80 thousand pairs.
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
+const BYTES_PER_MB: f64 = 1e6;
 
 /// Memory use at one time, bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -45,6 +46,24 @@ pub struct Sample {
     pub viewers: usize,
     /// Number of pictures that the viewers received.
     pub pictures: u64,
+}
+
+impl Sample {
+    /// The sample in one line.
+    #[must_use]
+    pub fn summary(&self) -> String {
+        let mb = |bytes: u64| bytes as f64 / BYTES_PER_MB;
+        format!(
+            "{:7.1} s  {:8.1} MB resident  {:8.1} MB on the GPU  {:7.1} MB model  {:8.1} MB in {} keyframes, step {}",
+            self.seconds,
+            mb(self.resident_bytes),
+            mb(self.gpu_bytes),
+            mb(self.model_bytes),
+            mb(self.keyframe_bytes),
+            self.keyframes,
+            self.step,
+        )
+    }
 }
 
 /// Part of the resident memory that is excluded from the growth rate.

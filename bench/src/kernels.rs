@@ -81,6 +81,43 @@ pub struct KernelsRow {
     pub passes: Vec<(&'static str, f64)>,
 }
 
+impl KernelsRow {
+    /// The row as text: the times, the amount of work, then a line for each pass.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let [width, height] = self.size_px;
+        let figures = &self.figures;
+        let packed = figures
+            .packed_millis
+            .map(|millis| format!("packed {millis:.3} ms, "))
+            .unwrap_or_default();
+        let mut lines = vec![
+            format!(
+                "{width}x{height} {:>8} splats: image {:.3} ms, {packed}step {:.3} ms (wall {:.3}, {:.3}; only the {} splats in view {:.3} ms), mean {:.5?}, peak {} MB",
+                self.n_splats,
+                figures.render_millis,
+                figures.step_millis,
+                figures.render_wall_millis,
+                figures.step_wall_millis,
+                figures.n_splats_in_view,
+                figures.step_visible_millis,
+                figures.mean_rgb,
+                figures.peak_bytes >> 20
+            ),
+            format!("    {}", figures.work),
+        ];
+        lines.extend(pass_lines(&self.passes));
+        lines
+    }
+}
+
+/// A line of text for each pass.
+pub(crate) fn pass_lines(passes: &[(&'static str, f64)]) -> impl Iterator<Item = String> {
+    passes
+        .iter()
+        .map(|(name, millis)| format!("    {millis:>9.4} ms  {name}"))
+}
+
 /// Measures every number of splats at every image size.
 ///
 /// * `on_row`: receives each row. If it returns an error, the bench ends.

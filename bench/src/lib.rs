@@ -43,6 +43,7 @@ mod growth;
 pub mod kernels;
 pub mod live;
 mod live_disturbance;
+mod measured_run;
 pub mod memory;
 mod over_time;
 mod peer;
@@ -59,6 +60,7 @@ pub use disturb::Disturbance;
 pub use findings::{BenchResult, Findings};
 pub use growth::{Excluded, Growth, Sample, resident_bytes};
 pub use live_disturbance::LiveDisturbance;
+pub use measured_run::{MeasuredRun, RequestedRun, StartRun};
 pub use over_time::{Bucket, OverTime, Timeline, Trend};
 pub use runs::{
     BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions,

@@ -7,6 +7,7 @@ use kinematics::Stamp;
 use serde::Serialize;
 use session::KeyframeChange;
 use std::fmt;
+use std::str::FromStr;
 use std::sync::Arc;
 
 /// A disturbance of a live run.
@@ -21,7 +22,7 @@ pub struct LiveDisturbance {
 
 impl LiveDisturbance {
     /// Adds a clock offset to the stamps of all cameras.
-    pub fn apply_to_rig(self, rig: &mut Rig) {
+    pub(crate) fn apply_to_rig(self, rig: &mut Rig) {
         if self.disturbance != Disturbance::ClockOffset {
             return;
         }
@@ -40,8 +41,7 @@ impl LiveDisturbance {
 
     /// The change of each keyframe by pose noise or an exposure step. The exposure changes
     /// `step_after_secs` after the first keyframe.
-    #[must_use]
-    pub fn keyframe_change(self, seed: u64, step_after_secs: f64) -> Option<KeyframeChange> {
+    pub(crate) fn keyframe_change(self, seed: u64, step_after_secs: f64) -> Option<KeyframeChange> {
         match self.disturbance {
             Disturbance::PoseNoise => Some(Box::new(move |keyframe| {
                 self.disturbance
@@ -68,6 +68,38 @@ impl LiveDisturbance {
             }
             Disturbance::ClockOffset | Disturbance::Keyframes => None,
         }
+    }
+}
+
+/// A text is not a disturbance of a live run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "must be pose-noise:MM up to 1000, clock-offset:MS up to 500 or exposure:EV up to 10, such as exposure:0.5"
+)]
+pub struct InvalidDisturbance;
+
+impl FromStr for LiveDisturbance {
+    type Err = InvalidDisturbance;
+
+    /// Reads a name and a size, such as `exposure:0.5`.
+    fn from_str(text: &str) -> Result<Self, InvalidDisturbance> {
+        let (name, level) = text.split_once(':').ok_or(InvalidDisturbance)?;
+        let disturbance = Disturbance::ALL
+            .into_iter()
+            .find(|disturbance| disturbance.name() == name.trim())
+            .ok_or(InvalidDisturbance)?;
+        let max = match disturbance {
+            Disturbance::PoseNoise => 1000.0,
+            Disturbance::ClockOffset => 500.0,
+            Disturbance::Exposure => 10.0,
+            // A live run has no fixed number of keyframes.
+            Disturbance::Keyframes => return Err(InvalidDisturbance),
+        };
+        let level = level.trim().parse().map_err(|_| InvalidDisturbance)?;
+        if !(0.0..=max).contains(&level) {
+            return Err(InvalidDisturbance);
+        }
+        Ok(Self { disturbance, level })
     }
 }
 

@@ -1,19 +1,24 @@
 //! Memory use of a long run by component, and its growth rate once the keyframe store is full.
 
-use crate::findings::Findings;
+use crate::findings::{BenchResult, Findings};
 use crate::growth::{Excluded, Growth, Sample, resident_bytes};
+use crate::measured_run::{MeasuredRun, RequestedRun, StartRun};
 use crate::statistics::extent;
-use crate::viewer::Viewer;
-use anyhow::Result;
+use crate::viewer::{Viewer, ViewerOptions};
+use anyhow::{Context, Result};
 use gpu::Gpu;
 use messages::counted;
 use numbers::quantile::{Rank, quantile};
 use report::Table;
 use report::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use session::LiveLoop;
+use session::{LiveLoop, RunInput};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
+/// Charts and numbers are written with this period, so that an interrupted bench leaves results.
+const WRITE_PERIOD: Duration = Duration::from_secs(60);
 /// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
@@ -27,19 +32,140 @@ const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
 const SECS_PER_MINUTE: f64 = 60.0;
 
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct MemoryOptions {
+    /// The rig file.
+    pub rig_file: PathBuf,
+    /// The devices, or a recording of them. Training continues after the end of a recording.
+    pub input: RunInput,
+    /// Length of the run from the first image, seconds.
+    pub seconds: f64,
+    /// Time between two samples.
+    pub sample_period: Duration,
+    /// Number of viewers that request pictures back to back.
+    pub n_viewers: u64,
+    /// Folder for charts and numbers.
+    pub out: PathBuf,
+}
+
+/// Result of [`run`].
+pub struct MemoryResult {
+    /// Charts and numbers of the part of the run that was measured.
+    pub result: BenchResult,
+    /// The error of a device that ended the run early, if any.
+    pub input_error: Option<drivers::Error>,
+}
+
+/// Measures the memory of a run until it ends, and writes charts and numbers.
+///
+/// * `start`: starts the run.
+/// * `on_sample`: receives each sample. If it returns an error, the bench ends.
+///
+/// # Errors
+///
+/// Fails if the run fails, or if the system does not report the memory of this process.
+pub fn run(
+    options: &MemoryOptions,
+    start: StartRun<'_>,
+    on_sample: impl FnMut(&Sample) -> Result<()>,
+) -> Result<MemoryResult> {
+    std::fs::create_dir_all(&options.out)
+        .with_context(|| format!("cannot create {}", options.out.display()))?;
+    // Checkpoints are part of a run, so this bench also writes them. Their folder is removed at the
+    // end.
+    let run_folder = options.out.join(format!("run-{}", std::process::id()));
+    let requested = RequestedRun {
+        rig_file: options.rig_file.clone(),
+        input: options.input.clone(),
+        seconds: options.seconds,
+        out: run_folder.clone(),
+    };
+    let measured = start(&requested).and_then(|started| options.measure(started, on_sample));
+    if run_folder.exists()
+        && let Err(error) = std::fs::remove_dir_all(&run_folder)
+    {
+        log::warn!("cannot remove {}: {error}", run_folder.display());
+    }
+    let (measured, input_error) = measured?;
+    let findings = measured.findings()?;
+    let page = findings.write(&options.out)?;
+    Ok(MemoryResult {
+        result: BenchResult {
+            findings,
+            page,
+            data_losses: Vec::new(),
+        },
+        input_error,
+    })
+}
+
+impl MemoryOptions {
+    /// Returns the measurements of a run, and the device error that ended it early, if any.
+    fn measure(
+        &self,
+        started: MeasuredRun,
+        mut on_sample: impl FnMut(&Sample) -> Result<()>,
+    ) -> Result<(MemoryRun, Option<drivers::Error>)> {
+        let viewers = started.connect(self.n_viewers, ViewerOptions::default())?;
+        let MeasuredRun {
+            mut run,
+            page: _page,
+        } = started;
+        let mut measured = MemoryRun {
+            input: self.input_text(),
+            n_viewers: self.n_viewers,
+            is_software: run.gpu.is_software(),
+            ..MemoryRun::default()
+        };
+        let mut due = Instant::now();
+        let mut written = Instant::now();
+        while run.run_time_slice()? {
+            let now = Instant::now();
+            if now < due {
+                continue;
+            }
+            // The period starts now and not at the last due time, so that a long step is not
+            // followed by several samples at once.
+            due = now + self.sample_period;
+            on_sample(&measured.add_sample(&run.live, &run.gpu, &viewers)?)?;
+            // The results are written during the run, so that they survive if the run is killed
+            // after hours, for example for lack of memory.
+            if written.elapsed() >= WRITE_PERIOD {
+                measured.findings()?.write(&self.out)?;
+                written = Instant::now();
+            }
+        }
+        drop(viewers);
+        Ok((measured, run.discard()?.input_result.input_error))
+    }
+
+    /// The devices or the recording, for the page.
+    fn input_text(&self) -> String {
+        let rig_file = self.rig_file.display();
+        match &self.input {
+            RunInput::Recording { path, .. } => path.display().to_string(),
+            RunInput::Devices {
+                is_simulated: true, ..
+            } => format!("{rig_file}, simulated"),
+            RunInput::Devices { .. } => rig_file.to_string(),
+        }
+    }
+}
+
 /// The measurements of a run.
 #[derive(Clone, Debug, Default)]
-pub struct MemoryRun {
+struct MemoryRun {
     /// The devices or the recording, for the page.
-    pub input: String,
+    input: String,
     /// Number of viewers that were connected.
-    pub n_viewers: u64,
+    n_viewers: u64,
     /// Whether GPU memory is host memory.
-    pub is_software: bool,
+    is_software: bool,
     /// Memory over time.
-    pub samples: Vec<Sample>,
+    samples: Vec<Sample>,
     /// GPU buffers at the last sample, bytes by label.
-    pub gpu_buffers: BTreeMap<Arc<str>, u64>,
+    gpu_buffers: BTreeMap<Arc<str>, u64>,
 }
 
 impl MemoryRun {
@@ -48,7 +174,7 @@ impl MemoryRun {
     /// # Errors
     ///
     /// Fails if the system does not report the memory of this process.
-    pub fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
+    fn add_sample(&mut self, live: &LiveLoop, gpu: &Gpu, viewers: &[Viewer]) -> Result<Sample> {
         let (sample, gpu_buffers) = sample(live, gpu, viewers)?;
         self.gpu_buffers = gpu_buffers;
         self.samples.push(sample);
@@ -60,7 +186,7 @@ impl MemoryRun {
     /// # Errors
     ///
     /// Fails if the system does not report the memory of this process.
-    pub fn findings(&self) -> Result<Findings> {
+    fn findings(&self) -> Result<Findings> {
         let samples = &self.samples;
         let growths = self.growths();
         let rate = growths.first().map_or(

@@ -87,6 +87,26 @@ pub struct RunReport<'a> {
     pub n_all: u64,
 }
 
+impl RunReport<'_> {
+    /// The result of the run in one line.
+    #[must_use]
+    pub fn summary(&self) -> String {
+        let end = &self.run.end;
+        let cached = if self.is_cached { ", done earlier" } else { "" };
+        format!(
+            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
+            self.n_done,
+            self.n_all,
+            self.run.name,
+            end.seconds,
+            end.step,
+            end.primitives,
+            end.bytes as f64 / 1e6,
+            self.run.psnr()
+        )
+    }
+}
+
 /// Settings that identify a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunSettings {

@@ -38,6 +38,41 @@ pub enum Part {
     Rigs,
 }
 
+impl Part {
+    /// All parts.
+    pub const ALL: [Self; 5] = [
+        Self::Speed,
+        Self::Coverage,
+        Self::Stability,
+        Self::ArmConfigurations,
+        Self::Rigs,
+    ];
+
+    /// Its name in options.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Speed => "speed",
+            Self::Coverage => "coverage",
+            Self::Stability => "stability",
+            Self::ArmConfigurations => "arm",
+            Self::Rigs => "rigs",
+        }
+    }
+
+    /// What is measured.
+    #[must_use]
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::Speed => "Time and error by the number of poses",
+            Self::Coverage => "How often the 95 % ellipsoid contains the truth",
+            Self::Stability => "Failures by rotation, number of poses and outliers",
+            Self::ArmConfigurations => "Joint offsets near singular configurations of an arm",
+            Self::Rigs => "Calibration without a target",
+        }
+    }
+}
+
 /// Scenes for the coverage of the reported uncertainty.
 #[derive(Clone, Copy, Debug)]
 pub struct CoverageScenes {

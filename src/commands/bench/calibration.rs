@@ -2,51 +2,18 @@
 
 use super::runs_args::print_result;
 use crate::exit::Exit;
+use crate::named_args::one_of;
 use crate::number_args::number_in_range;
 use bench::calibration::{CalibrationOptions, CoverageScenes, Part};
 use std::path::PathBuf;
-
-/// A part of the bench.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum PartArg {
-    /// Time and error by the number of poses
-    Speed,
-    /// How often the 95 % ellipsoid contains the truth
-    Coverage,
-    /// Failures by rotation, number of poses and outliers
-    Stability,
-    /// Joint offsets near singular configurations of an arm
-    Arm,
-    /// Calibration without a target
-    Rigs,
-}
-
-const ALL_PARTS: [PartArg; 5] = [
-    PartArg::Speed,
-    PartArg::Coverage,
-    PartArg::Stability,
-    PartArg::Arm,
-    PartArg::Rigs,
-];
-
-impl From<PartArg> for Part {
-    fn from(part: PartArg) -> Self {
-        match part {
-            PartArg::Speed => Self::Speed,
-            PartArg::Coverage => Self::Coverage,
-            PartArg::Stability => Self::Stability,
-            PartArg::Arm => Self::ArmConfigurations,
-            PartArg::Rigs => Self::Rigs,
-        }
-    }
-}
 
 /// Flags of `bench calibration`.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
     /// What to measure. The part `rigs` needs --rig
-    #[arg(long, value_name = "PART", value_delimiter = ',', value_enum, default_values_t = ALL_PARTS)]
-    parts: Vec<PartArg>,
+    #[arg(long, value_name = "PART", value_delimiter = ',', default_values = Part::ALL.map(Part::name),
+        value_parser = one_of(Part::ALL.map(|part| (part, part.name(), part.description()))))]
+    parts: Vec<Part>,
     /// With coverage: number of calibrations of each kind
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     runs: u64,
@@ -98,7 +65,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         out,
         ..
     } = args.clone();
-    let parts = parts.into_iter().map(Part::from).collect();
     let coverage = CoverageScenes {
         runs,
         first_seed,

@@ -2,7 +2,7 @@
 
 use crate::open_gpu::open_gpu;
 use crate::print;
-use bench::field::{FieldOptions, FieldRow};
+use bench::field::FieldOptions;
 
 /// Flags of `bench field`.
 #[derive(Debug, clap::Args)]
@@ -26,7 +26,9 @@ pub(crate) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    bench::field::measure(&args.options(), open_gpu, |row| args.print(row))
+    bench::field::measure(&args.options(), open_gpu, |row| {
+        print::json_or_lines(args.json, row, row.lines())
+    })
 }
 
 impl Args {
@@ -37,24 +39,5 @@ impl Args {
             n_repeats: self.repeats,
             profile: self.profile,
         }
-    }
-
-    fn print(&self, row: &FieldRow) -> anyhow::Result<()> {
-        if self.json {
-            return print::json(row);
-        }
-        print::line(format_args!(
-            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering {:.3} ms, peak {} MB",
-            row.rays,
-            row.samples,
-            row.step_millis,
-            row.step_wall_millis,
-            row.colors_millis,
-            row.peak_bytes >> 20
-        ))?;
-        for (name, millis) in &row.passes {
-            print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
-        }
-        Ok(())
     }
 }

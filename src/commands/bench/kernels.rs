@@ -1,8 +1,9 @@
 //! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
+use crate::number_args::size_up_to;
 use crate::open_gpu::open_gpu;
 use crate::print;
-use bench::kernels::{KernelsOptions, KernelsRow};
+use bench::kernels::KernelsOptions;
 use std::path::PathBuf;
 
 /// Maximum number of splats in a rig file.
@@ -17,8 +18,8 @@ pub(crate) struct Args {
     cloud: Option<PathBuf>,
     /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080;
     /// without a GPU 320x240]
-    #[arg(long, value_delimiter = ',', value_parser = parse_size)]
-    size: Vec<Size>,
+    #[arg(long, value_delimiter = ',', value_parser = size_up_to(16_384))]
+    size: Vec<[u32; 2]>,
     /// Numbers of splats, 1 to 100000000, separated by commas; cannot be combined with --cloud
     /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
     #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
@@ -43,67 +44,22 @@ pub(crate) struct Args {
     json: bool,
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Size([u32; 2]);
-
-fn parse_size(text: &str) -> Result<Size, String> {
-    text.split_once('x')
-        .and_then(|(width, height)| Some(Size([parse_side(width)?, parse_side(height)?])))
-        .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
-}
-
-fn parse_side(text: &str) -> Option<u32> {
-    text.parse::<u32>()
-        .ok()
-        .filter(|size| (1..=16_384).contains(size))
-}
-
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
-    bench::kernels::measure(&args.options(), open_gpu, |row| args.print(row))
+    bench::kernels::measure(&args.options(), open_gpu, |row| {
+        print::json_or_lines(args.json, row, row.lines())
+    })
 }
 
 impl Args {
     fn options(&self) -> KernelsOptions {
         KernelsOptions {
             cloud: self.cloud.clone(),
-            sizes_px: self.size.iter().map(|Size(size_px)| *size_px).collect(),
+            sizes_px: self.size.clone(),
             n_splats: self.splats.clone(),
             n_repeats: self.repeats,
             inside: self.inside,
             scan: self.scan,
             profile: self.profile,
         }
-    }
-
-    fn print(&self, row: &KernelsRow) -> anyhow::Result<()> {
-        if self.json {
-            return print::json(row);
-        }
-        let KernelsRow {
-            size_px: [width, height],
-            n_splats,
-            figures,
-            passes,
-        } = row;
-        print::line(format_args!(
-            "{width}x{height} {n_splats:>8} splats: image {:.3} ms, {}step {:.3} ms (wall {:.3}, {:.3}; only the {} splats in view {:.3} ms), mean {:.5?}, peak {} MB",
-            figures.render_millis,
-            figures
-                .packed_millis
-                .map(|millis| format!("packed {millis:.3} ms, "))
-                .unwrap_or_default(),
-            figures.step_millis,
-            figures.render_wall_millis,
-            figures.step_wall_millis,
-            figures.n_splats_in_view,
-            figures.step_visible_millis,
-            figures.mean_rgb,
-            figures.peak_bytes >> 20
-        ))?;
-        print::line(format_args!("    {}", figures.work))?;
-        for (name, millis) in passes {
-            print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
-        }
-        Ok(())
     }
 }

@@ -94,23 +94,6 @@ impl BenchObserver for Printer {
             print_json(report);
             return;
         }
-        let run = report.run;
-        let end = &run.end;
-        let cached = if report.is_cached {
-            ", done earlier"
-        } else {
-            ""
-        };
-        print::report(format_args!(
-            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
-            report.n_done,
-            report.n_all,
-            run.name,
-            end.seconds,
-            end.step,
-            end.primitives,
-            end.bytes as f64 / 1e6,
-            run.psnr()
-        ));
+        print::report(report.summary());
     }
 }

@@ -2,8 +2,10 @@
 
 use super::runs_args::RunsArgs;
 use crate::exit::Exit;
+use crate::named_args::one_of;
 use bench::Disturbance;
 use bench::stability::StabilityOptions;
+use clap::builder::TypedValueParser;
 use std::path::PathBuf;
 
 /// Flags of `bench stability`.
@@ -16,9 +18,10 @@ pub(crate) struct Args {
         long,
         value_name = "WHAT,...",
         value_delimiter = ',',
-        default_value = "all"
+        default_value = "all",
+        value_parser = disturbances()
     )]
-    disturb: Vec<DisturbanceArg>,
+    disturb: Vec<Option<Disturbance>>,
     /// Sizes of the disturbance instead of the default sizes (mm, ms, EV or keyframes), separated
     /// by commas. Needs a single disturbance
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
@@ -40,18 +43,16 @@ pub(crate) struct Args {
     runs: RunsArgs,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum DisturbanceArg {
-    /// Errors of training poses: 0 to 50 mm and 0 to 5 degrees
-    PoseNoise,
-    /// Poses from 0 to 200 ms after the image stamps
-    ClockOffset,
-    /// A sudden change of the exposure by 0 to 1 EV in the middle of the capture
-    Exposure,
-    /// 3 to 300 training keyframes
-    Keyframes,
-    /// All disturbances
-    All,
+/// The disturbances, and `None` for all of them.
+fn disturbances() -> impl TypedValueParser<Value = Option<Disturbance>> {
+    let each = Disturbance::ALL.map(|disturbance| {
+        (
+            Some(disturbance),
+            disturbance.name(),
+            disturbance.description(),
+        )
+    });
+    one_of(each.into_iter().chain([(None, "all", "All disturbances")]))
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
@@ -61,33 +62,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 impl Args {
     fn options(&self) -> StabilityOptions {
-        let disturbances = Disturbance::ALL.into_iter().filter(|disturbance| {
-            self.disturb
-                .iter()
-                .any(|selected| selected.includes(*disturbance))
-        });
+        let is_selected = |disturbance: &Disturbance| {
+            (self.disturb.iter()).any(|selected| selected.is_none_or(|one| one == *disturbance))
+        };
         StabilityOptions {
             data: self.data.clone(),
-            disturbances: disturbances.collect(),
-            can_skip_clock_offset: !self.disturb.contains(&DisturbanceArg::ClockOffset),
+            disturbances: Disturbance::ALL.into_iter().filter(is_selected).collect(),
+            can_skip_clock_offset: !self.disturb.contains(&Some(Disturbance::ClockOffset)),
             levels: self.levels.clone(),
             rate_hz: self.rate_hz,
             seconds: self.seconds,
             steps: self.steps,
             seeds: self.seeds,
             runs: self.runs.options(),
-        }
-    }
-}
-
-impl DisturbanceArg {
-    fn includes(self, disturbance: Disturbance) -> bool {
-        match self {
-            Self::All => true,
-            Self::PoseNoise => disturbance == Disturbance::PoseNoise,
-            Self::ClockOffset => disturbance == Disturbance::ClockOffset,
-            Self::Exposure => disturbance == Disturbance::Exposure,
-            Self::Keyframes => disturbance == Disturbance::Keyframes,
         }
     }
 }

@@ -1,5 +1,4 @@
-//! Measures a live run with correct and wrong calibration. The measurements are the latency of
-//! pictures and keyframes, the training speed, and the accuracy over time.
+//! The measurements of a live run, and their tables and charts.
 //!
 //! All times are on the clock of this process, from mid-exposure of an image to the arrival of a
 //! picture at its viewer.
@@ -38,7 +37,7 @@ pub struct HandEyeError {
 
 impl HandEyeError {
     /// Applies the error to all cameras on the flange, for each camera in its own frame.
-    pub fn apply(self, rig: &mut Rig) {
+    pub(super) fn apply(self, rig: &mut Rig) {
         let mut random = Random::new(self.seed);
         let mut direction = || UnitVector3::new_normalize(Vector3::from_fn(|_, _| random.normal()));
         let rotation = UnitQuaternion::from_axis_angle(&direction(), self.degrees.to_radians());
@@ -127,8 +126,7 @@ pub struct InputCounts {
 
 impl InputCounts {
     /// Counts of an input that has ended.
-    #[must_use]
-    pub fn of(input_result: &InputResult) -> Self {
+    pub(super) fn of(input_result: &InputResult) -> Self {
         let counts = input_result.join.counts();
         Self {
             images: counts.images,
@@ -144,8 +142,7 @@ impl InputCounts {
 
 impl LiveRun {
     /// Collects the measurements of a run that is over, except for the counts of its input.
-    #[must_use]
-    pub fn of(
+    pub(super) fn of(
         conditions: Conditions,
         live: &LiveLoop,
         viewers: &[Viewer],
@@ -180,9 +177,24 @@ impl LiveRun {
         }
     }
 
-    /// A duration by name.
+    /// The measurements in one line.
     #[must_use]
-    pub fn latency(&self, name: &str) -> Option<Latency> {
+    pub fn summary(&self) -> String {
+        let picture = self.latency("request to complete picture");
+        let picture = picture.map_or(String::new(), |latency| {
+            format!("  picture {:.1} ms (99 %: {:.1})", latency.p50, latency.p99)
+        });
+        let psnr = self.psnr.last().map_or(String::new(), |(seconds, psnr)| {
+            format!("  {psnr:.2} dB at {seconds:.0} s")
+        });
+        format!(
+            "{}: {:.1} steps per second{picture}{psnr}",
+            self.conditions, self.steps_per_sec
+        )
+    }
+
+    /// A duration by name.
+    fn latency(&self, name: &str) -> Option<Latency> {
         self.latencies
             .iter()
             .find(|(known, _)| *known == name)
@@ -406,8 +418,7 @@ fn over_time_chart(input: &str, run: &LiveRun) -> Chart {
 /// A table and a chart of runs on the same recording.
 ///
 /// * `input`: the recording and the pictures, for the page.
-#[must_use]
-pub fn findings(input: &str, runs: &[LiveRun]) -> Findings {
+pub(super) fn findings(input: &str, runs: &[LiveRun]) -> Findings {
     let head: Vec<String> = std::iter::once("quantity".to_owned())
         .chain(runs.iter().map(|run| run.conditions.to_string()))
         .collect();
