@@ -8,9 +8,10 @@ use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands;
 use session::{
-    FinishedModel, FinishedRun, Limits, Observer, ReadProgress, SessionEvent, end_lines, run_log,
+    FinishedModel, FinishedRun, Limits, Observer, ProgressLines, ReadProgress, SessionEvent,
+    end_lines, run_log,
 };
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use viz::Verdict;
 
 /// What is printed about a session.
@@ -184,46 +185,40 @@ fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }
 
-/// Lines about progress, for outputs without a progress bar, that is, outputs that are not a
-/// terminal.
-pub(crate) struct ProgressLines {
-    is_shown: bool,
-    n_last: usize,
-    last_at: Instant,
+/// A progress bar for work that is counted. It is cleared when the value is dropped.
+pub(crate) struct CountedWork {
+    template: &'static str,
+    is_hidden: bool,
+    shown: Option<(ProgressBar, ProgressLines)>,
 }
 
-impl ProgressLines {
-    /// After this time, a line is printed even if less than a tenth was done.
-    const MAX_PERIOD: Duration = Duration::from_secs(10);
-    /// Work that takes less time than this needs no lines.
-    const MIN_PERIOD: Duration = Duration::from_secs(1);
-
-    /// Lines for work that begins at `now`. They replace a hidden progress bar.
-    pub(crate) fn new(is_shown: bool, now: Instant) -> Self {
+impl CountedWork {
+    /// A bar that appears when there is progress for the first time, unless it is hidden.
+    pub(crate) fn new(template: &'static str, is_hidden: bool) -> Self {
         Self {
-            is_shown,
-            n_last: 0,
-            last_at: now,
+            template,
+            is_hidden,
+            shown: None,
         }
     }
 
-    /// Whether a line is due at `now`. A line is due if some work remains, and if since the last
-    /// line a tenth of the whole was done, or a period has passed in which anything was done.
-    pub(crate) fn is_due(&mut self, n_done: usize, n_all: usize, now: Instant) -> bool {
-        let elapsed = now.duration_since(self.last_at);
-        let is_tenth = n_done.saturating_sub(self.n_last) >= n_all.div_ceil(10);
-        let min_period = if is_tenth {
-            Self::MIN_PERIOD
-        } else {
-            Self::MAX_PERIOD
-        };
-        let is_due =
-            self.is_shown && n_done > self.n_last && n_done < n_all && elapsed >= min_period;
-        if is_due {
-            self.n_last = n_done;
-            self.last_at = now;
+    /// Shows the progress. Returns whether a line about it is due, because stderr is not a terminal.
+    pub(crate) fn show(&mut self, n_done: usize, n_all: usize) -> bool {
+        let (bar, lines) = self.shown.get_or_insert_with(|| {
+            let bar = print::bar(Some(n_all as u64), self.template, self.is_hidden);
+            let lines = ProgressLines::new(bar.is_hidden() && !self.is_hidden, Instant::now());
+            (bar, lines)
+        });
+        bar.set_position(n_done as u64);
+        lines.is_due(n_done, n_all, Instant::now())
+    }
+}
+
+impl Drop for CountedWork {
+    fn drop(&mut self) {
+        if let Some((bar, _)) = &self.shown {
+            bar.finish_and_clear();
         }
-        is_due
     }
 }
 
@@ -291,40 +286,5 @@ fn clear(bar: &mut Option<(&'static str, ProgressBar, ProgressLines)>) {
 impl Drop for ReadBar {
     fn drop(&mut self) {
         self.end();
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn progress_lines_are_due_every_tenth_or_ten_seconds() {
-        let start = Instant::now();
-        let at = |millis: u64| start + Duration::from_millis(millis);
-        let mut lines = ProgressLines::new(true, start);
-        for (n_done, millis, expected) in [
-            // Fast work needs no lines.
-            (10, 900, false),
-            (10, 1000, true),
-            (19, 9000, false),
-            (20, 9500, true),
-            // Slow work has a line if anything was done.
-            (20, 40_000, false),
-            (21, 40_100, true),
-            (22, 50_000, false),
-            (22, 50_100, true),
-            (99, 60_000, true),
-            // The result follows.
-            (100, 99_000, false),
-        ] {
-            assert_eq!(
-                lines.is_due(n_done, 100, at(millis)),
-                expected,
-                "{n_done} after {millis} ms"
-            );
-        }
-        let mut hidden = ProgressLines::new(false, start);
-        assert!(!hidden.is_due(10, 100, at(60_000)));
     }
 }

@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 45] = [
+const PRINTED_BY: [(&str, &[&str]); 44] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -110,13 +110,12 @@ const PRINTED_BY: [(&str, &[&str]); 45] = [
             "calibrate hand-eye",
         ],
     ),
-    // These build command lines for another command.
-    ("src/commands/bench/live.rs", &["run"]),
+    // This builds command lines for another command.
     ("src/commands/bench/run_flags.rs", &["run"]),
 ];
 
 /// Settings in messages of libraries, where the message names a command that accepts the setting.
-const NAMED_WITH_COMMAND: [(&str, Setting, &str); 26] = [
+const NAMED_WITH_COMMAND: [(&str, Setting, &str); 28] = [
     (
         "capture/src/calibration_commands.rs",
         Setting::Camera,
@@ -141,6 +140,7 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 26] = [
     ("capture/src/doctor/mod.rs", Setting::Sim, "run"),
     ("capture/src/emulation/mod.rs", Setting::Sim, "run"),
     ("capture/src/found_devices.rs", Setting::Sim, "run"),
+    ("capture/src/init/plan.rs", Setting::Sim, "run"),
     ("capture/src/init/rig_text.rs", Setting::Sim, "run"),
     (
         "capture/src/init/rig_text.rs",
@@ -158,6 +158,7 @@ const NAMED_WITH_COMMAND: [(&str, Setting, &str); 26] = [
     ("session/src/next_commands.rs", Setting::Keyframes, "eval"),
     ("session/src/next_commands.rs", Setting::Out, "export"),
     ("session/src/next_commands.rs", Setting::To, "export"),
+    ("session/src/page_check.rs", Setting::Listen, "run"),
     ("session/src/resume_command.rs", Setting::From, "run"),
     ("session/src/resume_command.rs", Setting::RealTime, "run"),
     ("session/src/resume_command.rs", Setting::Repeat, "run"),

@@ -1,10 +1,10 @@
 //! Flags shared by all commands that train. They override the keys of the same name in a rig file.
 
+use crate::named_args::one_of;
 use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
-use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::builder::TypedValueParser;
 use clap::value_parser;
-use messages::listed;
-use session::{Refine, TrainingOptions};
+use session::{Refine, TrainingOptions, methods_in};
 use std::sync::LazyLock;
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
@@ -62,8 +62,8 @@ pub(crate) struct TrainingArgs {
     /// --max-splats, or to 8000 splats per image if there are fewer than 40 images; then halve the
     /// number as long as this costs less than 0.1 dB on validation images [default: to-cap; for
     /// data on disk with a GPU: tested]
-    #[arg(long, value_name = "HOW", hide_possible_values = true)]
-    pub(crate) count: Option<CountArg>,
+    #[arg(long, value_name = "HOW", hide_possible_values = true, value_parser = count_policy())]
+    pub(crate) count: Option<CountPolicy>,
 }
 
 /// Distinct scene models, at least one.
@@ -71,19 +71,7 @@ pub(crate) struct TrainingArgs {
 pub(crate) struct Methods(Vec<ModelKind>);
 
 fn methods(text: &str) -> Result<Methods, String> {
-    let mut kinds = Vec::new();
-    for name in text.split(',') {
-        let kind = ModelKind::from_name(name).ok_or_else(|| {
-            let known: Vec<&str> = ModelKind::ALL.iter().map(|kind| kind.name()).collect();
-            format!("unknown method {name:?}, expected {}", listed(&known, "or"))
-        })?;
-        // Two models of one method would share a folder.
-        if kinds.contains(&kind) {
-            return Err(format!("{name} is listed twice"));
-        }
-        kinds.push(kind);
-    }
-    Ok(Methods(kinds))
+    methods_in(text).map(Methods)
 }
 
 /// Parses a value of `--max-bytes`.
@@ -102,22 +90,15 @@ fn max_bytes(text: &str) -> Result<u64, String> {
 
 /// Parses a value of `--refine`.
 fn refine() -> impl TypedValueParser<Value = Refine> {
-    PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name))
-        .try_map(|name| refine_named(&name).ok_or("unknown parameter"))
+    one_of(Refine::ALL.map(|(name, refine)| (refine, name, "")))
 }
 
-fn refine_named(name: &str) -> Option<Refine> {
-    Refine::ALL
-        .into_iter()
-        .find(|(known, _)| *known == name)
-        .map(|(_, refine)| refine)
-}
-
-/// Values of `--count`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum CountArg {
-    Tested,
-    ToCap,
+/// Parses a value of `--count`.
+fn count_policy() -> impl TypedValueParser<Value = CountPolicy> {
+    one_of([
+        (CountPolicy::Tested, "tested", ""),
+        (CountPolicy::ToCap, "to-cap", ""),
+    ])
 }
 
 impl TrainingArgs {
@@ -129,10 +110,7 @@ impl TrainingArgs {
             max_bytes: self.max_bytes,
             max_splats: self.max_splats,
             refine: self.refine.clone(),
-            count: self.count.map(|count| match count {
-                CountArg::Tested => CountPolicy::Tested,
-                CountArg::ToCap => CountPolicy::ToCap,
-            }),
+            count: self.count,
         }
     }
 }
@@ -150,28 +128,5 @@ mod tests {
             .map(|argument| argument.get_id().as_str())
             .collect();
         assert_eq!(ids, TRAINING_ARGS);
-    }
-
-    fn kind(name: &str) -> ModelKind {
-        ModelKind::from_name(name).expect("registered")
-    }
-
-    #[test]
-    fn methods_are_distinct() {
-        assert_eq!(
-            methods("tsdf,splat").map(|Methods(kinds)| kinds),
-            Ok(vec![kind("tsdf"), kind("splat")])
-        );
-        for (text, message) in [
-            ("mesh", "\"mesh\""),
-            ("splat,splat", "listed twice"),
-            ("splat,", "\"\""),
-            ("", "\"\""),
-        ] {
-            assert!(
-                methods(text).is_err_and(|error| error.contains(message)),
-                "{text}"
-            );
-        }
     }
 }

@@ -5,12 +5,39 @@ use crate::recoveries::OpenGpu;
 use crate::{methods, run_folder};
 use anyhow::{Context, ensure};
 use messages::{BadInput, Setting, counted, listed};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
 use trainer::method_entry::{Export, ExportRequest, ExportWriter, Exported};
 
 /// The output format for recordings: a folder.
 pub const NERFSTUDIO: &str = "nerfstudio";
+
+/// The output formats of all methods and of recordings, each with a description.
+#[must_use]
+pub fn export_formats() -> Vec<(&'static str, String)> {
+    let mut contents: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for export in ModelKind::ALL.iter().flat_map(|kind| kind.entry().exports) {
+        let contents = contents.entry(export.format).or_default();
+        contents.push(export.contents);
+    }
+    let mut formats: Vec<_> = contents
+        .into_iter()
+        .map(|(format, contents)| {
+            let contents = listed(&contents, "or");
+            (
+                format,
+                format!("From a model: its {contents}, as .{format}"),
+            )
+        })
+        .collect();
+    formats.push((
+        NERFSTUDIO,
+        "From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists"
+            .to_owned(),
+    ));
+    formats
+}
 
 /// Options of an export.
 #[derive(Clone, Debug)]

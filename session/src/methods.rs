@@ -67,6 +67,27 @@ pub fn methods_of(rig: &Rig) -> anyhow::Result<Vec<ModelKind>> {
     Ok(rig.train.methods.resolve(&known)?)
 }
 
+/// The methods in a list of names, separated by commas.
+///
+/// # Errors
+///
+/// A message, if a name is unknown or listed twice.
+pub fn methods_in(text: &str) -> Result<Vec<ModelKind>, String> {
+    let mut kinds = Vec::new();
+    for name in text.split(',') {
+        let kind = ModelKind::from_name(name).ok_or_else(|| {
+            let known: Vec<&str> = ModelKind::ALL.iter().map(|kind| kind.name()).collect();
+            format!("unknown method {name:?}, expected {}", listed(&known, "or"))
+        })?;
+        // Two models of one method would share a folder.
+        if kinds.contains(&kind) {
+            return Err(format!("{name} is listed twice"));
+        }
+        kinds.push(kind);
+    }
+    Ok(kinds)
+}
+
 /// Why there is no model of the requested method among these.
 pub(crate) fn unknown(kinds: impl Iterator<Item = ModelKind>, requested: Option<&str>) -> String {
     let names = kinds.map(ModelKind::name).collect::<Vec<_>>().join(" or ");
@@ -87,6 +108,26 @@ mod tests {
             note,
             "splats.ply contains no splats: its pictures show only the background"
         );
+    }
+
+    #[test]
+    fn listed_methods_are_known_and_distinct() {
+        let kind = |name| ModelKind::from_name(name).expect("registered");
+        assert_eq!(
+            methods_in("tsdf,splat"),
+            Ok(vec![kind("tsdf"), kind("splat")])
+        );
+        for (text, message) in [
+            ("mesh", "\"mesh\""),
+            ("splat,splat", "listed twice"),
+            ("splat,", "\"\""),
+            ("", "\"\""),
+        ] {
+            assert!(
+                methods_in(text).is_err_and(|error| error.contains(message)),
+                "{text}"
+            );
+        }
     }
 
     #[test]

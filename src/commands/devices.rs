@@ -43,11 +43,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn print_devices(devices: &[DeviceInfo], args: &Args) -> anyhow::Result<()> {
     for device in std::iter::once(&gpu_device(open_gpu)).chain(devices) {
-        if args.json {
-            print::json(device)?;
-        } else {
-            print::lines(device.lines())?;
-        }
+        print::json_or_lines(args.json, device, device.lines())?;
     }
     if !args.json {
         print::line(
@@ -66,11 +62,7 @@ fn print_changes(watch: &mut DeviceWatch, as_json: bool) -> anyhow::Result<()> {
     while !stop.requested() {
         std::thread::sleep(LOOK_INTERVAL);
         for change in watch.look() {
-            if as_json {
-                print::json(&change)?;
-            } else {
-                print::line(change)?;
-            }
+            print::json_or_lines(as_json, &change, [&change])?;
         }
     }
     Ok(())

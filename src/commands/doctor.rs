@@ -1,8 +1,6 @@
 //! `fieldrig doctor`: checks this computer and the devices of a rig, and prints a fix for each
 //! problem.
 
-mod page_address;
-
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
@@ -11,7 +9,7 @@ use anyhow::Context;
 use capture::Rig;
 use capture::doctor::{self, Finding, Verdict};
 use capture::rig_facts;
-use session::gpu_findings;
+use session::{gpu_findings, page_finding};
 use std::path::PathBuf;
 
 /// Default address of the page that `run` serves.
@@ -66,7 +64,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     findings.extend(gpu_findings(open_gpu));
     findings.push(doctor::simulation());
-    findings.push(page_address::page_address(DEFAULT_ADDRESS));
+    findings.push(page_finding(DEFAULT_ADDRESS));
     findings.extend(doctor::check(rig.as_ref()));
     // The checks are printed before listening, because listening takes as long as the user asks
     // for.
@@ -74,11 +72,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
         let result = doctor::listen(rig, secs, &signals::stop_on_signals()?)?;
         for device in &result.devices {
-            if args.json {
-                print::json(device)?;
-            } else {
-                print::line(device)?;
-            }
+            print::json_or_lines(args.json, device, [device])?;
         }
         print_findings(&result.findings, args.json)?;
         findings.extend(result.findings);
@@ -93,11 +87,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
     for finding in findings {
-        if as_json {
-            print::json(finding)?;
-            continue;
-        }
-        print::lines(finding.lines())?;
+        print::json_or_lines(as_json, finding, finding.lines())?;
     }
     Ok(())
 }

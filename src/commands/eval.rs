@@ -1,13 +1,12 @@
 //! `fieldrig eval`: scores a saved model on test images.
 
-use crate::console::{ProgressLines, ReadBar};
+use crate::console::{CountedWork, ReadBar};
 use crate::data_args::DataArgs;
 use crate::exit::{self, Exit};
 use crate::open_gpu::open_gpu;
 use crate::print;
 use session::EvalPlan;
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
@@ -37,31 +36,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         lpips_weights: args.lpips_weights.clone(),
     };
     let reading = ReadBar::new(args.json);
-    let mut scored = None;
+    let mut scored = CountedWork::new("{bar:30} {elapsed} scored {pos} of {len} images", args.json);
     let outcome = plan.run(
         open_gpu,
         &|read| reading.show(read),
         &mut |n_scored, n_all| {
-            let template = "{bar:30} {elapsed} scored {pos} of {len} images";
-            let (bar, lines) = scored.get_or_insert_with(|| {
-                let bar = print::bar(Some(n_all as u64), template, args.json);
-                let lines = ProgressLines::new(bar.is_hidden() && !args.json, Instant::now());
-                (bar, lines)
-            });
-            bar.set_position(n_scored as u64);
-            if lines.is_due(n_scored, n_all, Instant::now()) {
+            if scored.show(n_scored, n_all) {
                 log::info!("scored {n_scored} of {n_all} images");
             }
         },
     )?;
-    if let Some((bar, _)) = scored {
-        bar.finish_and_clear();
-    }
-    if args.json {
-        print::json(&outcome)?;
-    } else {
-        print::lines(outcome.lines())?;
-    }
+    drop(scored);
+    print::json_or_lines(args.json, &outcome, outcome.lines())?;
     // Scores of incomplete data are printed, but the exit code reports the loss.
     Ok(exit::from_losses(&outcome.data_losses))
 }

@@ -6,12 +6,8 @@ use crate::permission_args::PermissionArgs;
 use crate::work_lines::WorkLines;
 use crate::{print, signals};
 use clap::builder::{PossibleValue, PossibleValuesParser};
-use messages::listed;
-use session::{CheckedExport, ExportPlan, NERFSTUDIO, RecordingExport, Written};
-use std::collections::BTreeMap;
+use session::{CheckedExport, ExportPlan, RecordingExport, Written, export_formats};
 use std::path::PathBuf;
-use trainer::ModelKind;
-use trainer::method_entry::Export;
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -20,7 +16,7 @@ pub(crate) struct Args {
     #[arg(value_name = "MODEL|REC")]
     from: PathBuf,
     /// Output format
-    #[arg(long, value_parser = PossibleValuesParser::new(formats()))]
+    #[arg(long, value_parser = format_parser())]
     to: String,
     /// File (ply, spz, glb) or folder (nerfstudio) to write; must not exist
     #[arg(long, value_name = "PATH")]
@@ -39,32 +35,10 @@ pub(crate) struct Args {
     pub(crate) permissions: PermissionArgs,
 }
 
-/// The output formats of all methods and of recordings.
-fn formats() -> Vec<PossibleValue> {
-    let mut contents: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
-    for export in exports() {
-        contents
-            .entry(export.format)
-            .or_default()
-            .push(export.contents);
-    }
-    let format = |(format, contents): (_, Vec<&str>)| {
-        let contents = listed(&contents, "or");
-        PossibleValue::new(format).help(format!("From a model: its {contents}, as .{format}"))
-    };
-    let nerfstudio = PossibleValue::new(NERFSTUDIO).help(
-        "From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists",
-    );
-    contents
-        .into_iter()
-        .map(format)
-        .chain([nerfstudio])
-        .collect()
-}
-
-/// The output formats of all methods.
-fn exports() -> impl Iterator<Item = &'static Export> {
-    ModelKind::ALL.iter().flat_map(|kind| kind.entry().exports)
+/// The names of the output formats, with descriptions.
+fn format_parser() -> PossibleValuesParser {
+    let value = |(name, description)| PossibleValue::new(name).help(description);
+    PossibleValuesParser::new(export_formats().into_iter().map(value))
 }
 
 fn parse_cell_width(text: &str) -> Result<f64, String> {

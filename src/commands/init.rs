@@ -5,15 +5,13 @@ mod questions;
 use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
-use capture::CalibrationCommand;
 use capture::config::Parent;
-use capture::doctor::Finding;
 use capture::init::{NewRigFile, RigPlan, RobotChoice, SearchPlan, WantedCamera, Wishes, search};
 use capture::known_robots::KNOWN_ROBOTS;
 use drivers::NetworkAddress;
-use messages::{BadInput, quoted_for_shell};
+use messages::BadInput;
 use questions::Questions;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Flags of `init`.
 #[derive(Debug, clap::Args)]
@@ -126,7 +124,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Questions::new(args.yes).ask(&mut wishes, &mut findings, &args.rig)?;
     let plan = RigPlan::new(&wishes, &findings).map_err(|error| BadInput(format!("{error:#}")))?;
     file.write(&wishes, &plan)?;
-    report_plan(&args.rig, &plan, &wishes.robot.mesh_warnings(&args.rig));
+    let warnings = wishes.robot.mesh_warnings(&args.rig);
+    let report = plan.report(&args.rig, &warnings);
+    report.iter().for_each(print::report);
     Ok(Exit::Done)
 }
 
@@ -154,27 +154,6 @@ fn robot(args: &Args) -> anyhow::Result<RobotChoice> {
         (Some(name), _) => Ok(RobotChoice::named(name)?),
         (None, Some(urdf)) => RobotChoice::of_urdf(urdf, &args.rig),
         (None, None) => Ok(RobotChoice::Automatic),
-    }
-}
-
-fn report_plan(rig: &Path, plan: &RigPlan, warnings: &[Finding]) {
-    print::report("Assumed");
-    for assumption in &plan.assumptions {
-        print::report(format_args!("  {assumption}"));
-    }
-    if !warnings.is_empty() {
-        print::report("Warnings");
-        for warning in warnings {
-            print::report(format_args!("  {warning}"));
-        }
-    }
-    print::report(format_args!("Wrote {}. Next", rig.display()));
-    let rig = quoted_for_shell(&rig.to_string_lossy());
-    print::report(format_args!("  fieldrig doctor {rig}"));
-    print::report(format_args!("  fieldrig run {rig} --sim"));
-    for camera in plan.cameras_without_lens() {
-        let command = CalibrationCommand::Intrinsics.line(&rig, camera);
-        print::report(format_args!("  {command}"));
     }
 }
 

@@ -43,9 +43,5 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
         meters_per_count: args.meters_per_count,
     };
     let scores = comparison.run()?;
-    if args.json {
-        print::json(&scores)
-    } else {
-        Ok(print::line(scores.to_text())?)
-    }
+    print::json_or_lines(args.json, &scores, [scores.to_text()])
 }

@@ -1,13 +1,13 @@
 //! `fieldrig render`: renders images of a saved model.
 
-use crate::console::ProgressLines;
+use crate::console::CountedWork;
 use crate::exit::Exit;
+use crate::number_args::size_up_to;
 use crate::open_gpu::open_gpu;
 use crate::{print, signals};
 use messages::{BadInput, counted};
 use session::{RenderPlan, RenderedCameras};
 use std::path::PathBuf;
-use std::time::Instant;
 
 /// Maximum width and height of an image.
 const MAX_SIDE_PX: u32 = 16_384;
@@ -26,7 +26,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
     pose: Option<Numbers<16>>,
     /// Size of the images [default: size in the camera path, else 1280x720]
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size_up_to(MAX_SIDE_PX))]
     size: Option<[u32; 2]>,
     /// Vertical field of view, degrees [default: value in the camera path, else 60]
     #[arg(long, value_name = "DEGREES")]
@@ -81,30 +81,13 @@ fn corners(text: &str) -> Result<Numbers<6>, String> {
     Ok(corners)
 }
 
-fn size(text: &str) -> Result<[u32; 2], String> {
-    let sides = text
-        .split_once('x')
-        .and_then(|(width, height)| Some([width.parse().ok()?, height.parse().ok()?]));
-    sides
-        .filter(|sides: &[u32; 2]| sides.iter().all(|side| (1..=MAX_SIDE_PX).contains(side)))
-        .ok_or_else(|| {
-            format!("expected WIDTHxHEIGHT, such as 1280x720, each side at most {MAX_SIDE_PX}")
-        })
-}
-
 /// Renders every camera of the path.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let plan = args.plan()?;
     signals::remove_partial_files_on_signals()?;
-    let mut shown = None;
+    let mut progress = CountedWork::new("{bar:30} {pos} of {len}", args.json);
     let n_pictures = plan.run(open_gpu, &mut |n_done, n_all, rendered| {
-        let (bar, lines) = shown.get_or_insert_with(|| {
-            let bar = print::bar(Some(n_all as u64), "{bar:30} {pos} of {len}", args.json);
-            let lines = ProgressLines::new(bar.is_hidden() && !args.json, Instant::now());
-            (bar, lines)
-        });
-        bar.set_position(n_done as u64);
-        if lines.is_due(n_done, n_all, Instant::now()) {
+        if progress.show(n_done, n_all) {
             print::notice(format_args!("rendered {n_done} of {n_all} images"));
         }
         match rendered {
@@ -112,9 +95,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             _ => Ok(()),
         }
     })?;
-    if let Some((bar, _)) = shown {
-        bar.finish_and_clear();
-    }
+    drop(progress);
     if !args.json {
         let n_pictures = counted(n_pictures as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
@@ -152,11 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_and_numbers_are_parsed() {
-        assert_eq!(size("640x480"), Ok([640, 480]));
-        for invalid in ["640", "640x", "0x480", "99999x1", "640x480x3"] {
-            assert!(size(invalid).is_err(), "{invalid}");
-        }
+    fn numbers_are_parsed() {
         assert_eq!(
             numbers::<3>("1, -2 3.5").map(|Numbers(values)| values),
             Ok([1.0, -2.0, 3.5])

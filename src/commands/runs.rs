@@ -7,10 +7,9 @@ use crate::number_args::number_in_range;
 use crate::print;
 use anyhow::Context;
 use messages::{BadInput, counted};
-use serde::Serialize;
 use session::run_folder::RUNS;
-use session::runs::{self, KeptRun, OldRuns, RemovableRun, size};
-use std::io::{BufRead, ErrorKind, IsTerminal};
+use session::runs::{self, OldRuns, RemovableRun, RunList, size};
+use std::io::{BufRead, IsTerminal};
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
@@ -100,51 +99,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
 }
 
-/// The total of a list as JSON.
-#[derive(Debug, Serialize)]
-struct Total {
-    event: &'static str,
-    runs: usize,
-    bytes: u64,
-}
-
-/// A run as JSON.
-#[derive(Debug, Serialize)]
-struct RunEvent<'a> {
-    event: &'static str,
-    #[serde(flatten)]
-    run: &'a KeptRun,
-}
-
 fn list(args: &ListArgs) -> anyhow::Result<Exit> {
     let folder = &args.folder.folder;
-    let runs = match runs::list(folder) {
-        Ok(runs) => runs,
-        // The folder of the runs is made by the first run.
-        Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
-        Err(error) => {
-            return Err(error).with_context(|| format!("cannot read {}", folder.display()));
-        }
-    };
-    let bytes = runs.iter().map(|run| run.bytes).sum();
+    let runs = RunList::read(folder)?;
     if args.json {
-        for run in &runs {
-            print::json(&RunEvent { event: "run", run })?;
-        }
-        print::json(&Total {
-            event: "total",
-            runs: runs.len(),
-            bytes,
-        })?;
-        return Ok(Exit::Done);
+        runs.events().iter().try_for_each(print::json)?;
+    } else {
+        print::lines(runs.lines())?;
     }
-    print::lines(runs::table(&runs))?;
-    print::line(format_args!(
-        "{} in {}, {}",
-        counted(runs.len() as u64, "run"),
-        folder.display(),
-        size(bytes)
-    ))?;
     Ok(Exit::Done)
 }
 

@@ -19,6 +19,7 @@ use drivers::ur::emulated::{ControllerConfig, EmulatedController};
 use drivers::{Sample, Source, can, clock};
 use kinematics::{Stamp, Transform};
 use messages::{BadInput, Setting};
+use serde::Serialize;
 use sim::wire::{
     DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock,
     emulate_fci, emulate_servos, emulate_ur,
@@ -88,6 +89,34 @@ pub struct Emulation {
     /// Description of the damage of the recording, if the playback ends early because of it.
     pub damage: Option<String>,
     _devices: EmulatedDevices,
+}
+
+/// All devices are ready. This is printed as JSON.
+#[derive(Clone, Debug, Serialize)]
+pub struct ReadyEvent<'a> {
+    event: &'static str,
+    /// The rig file to run against the emulated devices.
+    pub rig: &'a Path,
+    /// Seconds until the playback begins.
+    pub starts_in_secs: f64,
+    /// Length of the playback, seconds.
+    pub seconds: f64,
+    /// One description per device.
+    pub devices: &'a [String],
+}
+
+impl Emulation {
+    /// The event of a plan whose devices are ready.
+    #[must_use]
+    pub fn ready_event(&self, plan: &EmulationPlan) -> ReadyEvent<'_> {
+        ReadyEvent {
+            event: "ready",
+            rig: &self.rig_file,
+            starts_in_secs: plan.start_in_secs,
+            seconds: plan.seconds,
+            devices: &self.descriptions,
+        }
+    }
 }
 
 impl EmulationPlan {

@@ -4,10 +4,13 @@ use super::arm_plan::{self, ArmPlan};
 use super::camera_guess;
 use super::findings::{Findings, FoundCamera};
 use super::wishes::{WantedCamera, Wishes};
+use crate::calibration_commands::CalibrationCommand;
 use crate::config::{CameraDriver, Parent};
+use crate::doctor::Finding;
 use anyhow::bail;
 use kinematics::Transform;
-use messages::Setting;
+use messages::{Setting, quoted_for_shell};
+use std::path::Path;
 
 /// Size and rate of the images of a camera that was not found: a usual mode of webcams.
 const DEFAULT_SIZE_PX: [u32; 2] = [640, 480];
@@ -78,6 +81,29 @@ impl RigPlan {
             field_of_view_deg: wishes.field_of_view_deg,
             assumptions,
         })
+    }
+
+    /// What was assumed and written, and the commands to run next, as lines of text.
+    ///
+    /// * `rig`: path of the rig file that was written.
+    /// * `warnings`: problems of the robot description.
+    #[must_use]
+    pub fn report(&self, rig: &Path, warnings: &[Finding]) -> Vec<String> {
+        let mut lines = vec!["Assumed".to_owned()];
+        lines.extend((self.assumptions.iter()).map(|assumption| format!("  {assumption}")));
+        if !warnings.is_empty() {
+            lines.push("Warnings".to_owned());
+            lines.extend(warnings.iter().map(|warning| format!("  {warning}")));
+        }
+        lines.push(format!("Wrote {}. Next", rig.display()));
+        let rig = quoted_for_shell(&rig.to_string_lossy());
+        lines.push(format!("  fieldrig doctor {rig}"));
+        lines.push(format!("  fieldrig run {rig} {}", Setting::Sim));
+        for camera in self.cameras_without_lens() {
+            let command = CalibrationCommand::Intrinsics.line(&rig, camera);
+            lines.push(format!("  {command}"));
+        }
+        lines
     }
 
     /// Names of the cameras that are found, but whose intrinsics are guesses.

@@ -7,4 +7,4 @@ mod table;
 
 pub use list::{KeptModel, KeptRun, RunState, list};
 pub use remove::{OldRuns, Refused, RemovableRun, by_age, by_name};
-pub use table::{size, table};
+pub use table::{RunList, RunListEvent, size};

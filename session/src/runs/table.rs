@@ -1,12 +1,88 @@
 //! A list of runs as a table of text.
 
-use super::list::{KeptModel, KeptRun};
+use super::list::{self, KeptModel, KeptRun};
 use crate::run_folder::utc_time;
+use anyhow::Context;
+use messages::counted;
+use serde::Serialize;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+/// The runs in a folder, to print them.
+#[derive(Clone, Debug)]
+pub struct RunList {
+    folder: PathBuf,
+    runs: Vec<KeptRun>,
+}
+
+/// A part of a list as JSON.
+#[derive(Clone, Copy, Debug, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum RunListEvent<'a> {
+    /// A run.
+    Run(&'a KeptRun),
+    /// All runs together.
+    Total {
+        /// Number of runs.
+        runs: usize,
+        /// Size of all files, bytes.
+        bytes: u64,
+    },
+}
+
+impl RunList {
+    /// Reads the runs in a folder. A folder that does not exist has no runs, because the first run
+    /// creates it.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the folder cannot be read.
+    pub fn read(folder: &Path) -> anyhow::Result<Self> {
+        let runs = match list::list(folder) {
+            Ok(runs) => runs,
+            Err(error) if error.kind() == ErrorKind::NotFound => Vec::new(),
+            Err(error) => {
+                return Err(error).with_context(|| format!("cannot read {}", folder.display()));
+            }
+        };
+        Ok(Self {
+            folder: folder.to_owned(),
+            runs,
+        })
+    }
+
+    /// The runs from old to new, then their total.
+    #[must_use]
+    pub fn events(&self) -> Vec<RunListEvent<'_>> {
+        let total = RunListEvent::Total {
+            runs: self.runs.len(),
+            bytes: self.bytes(),
+        };
+        let runs = self.runs.iter().map(RunListEvent::Run);
+        runs.chain([total]).collect()
+    }
+
+    /// A table of the runs, then a line with their total.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let mut lines = table(&self.runs);
+        lines.push(format!(
+            "{} in {}, {}",
+            counted(self.runs.len() as u64, "run"),
+            self.folder.display(),
+            size(self.bytes())
+        ));
+        lines
+    }
+
+    fn bytes(&self) -> u64 {
+        self.runs.iter().map(|run| run.bytes).sum()
+    }
+}
+
 /// The runs in columns, with a header if there are any.
-#[must_use]
-pub fn table(runs: &[KeptRun]) -> Vec<String> {
+fn table(runs: &[KeptRun]) -> Vec<String> {
     if runs.is_empty() {
         return Vec::new();
     }

@@ -39,11 +39,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let TimeOffsetOutcome { result, written } = args.task().run()?;
     let document = TimeOffsetDocument::of(result)?;
-    if args.json {
-        print::json(&document)?
-    } else {
-        print::lines(document.lines())?
-    }
+    print::json_or_lines(args.json, &document, document.lines())?;
     // The result is printed even if the report cannot be written.
     written?;
     match document.refusal() {

@@ -7,24 +7,10 @@ use capture::Stop;
 use capture::emulation::{EmulationPlan, Stage};
 use drivers::clock;
 use kinematics::Stamp;
-use serde::Serialize;
-use std::path::Path;
 use std::time::Duration;
 
 /// How often Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(50);
-
-/// Printed when all devices are ready.
-#[derive(Debug, Serialize)]
-struct ReadyEvent<'a> {
-    event: &'static str,
-    /// The rig file to run against the emulated devices.
-    rig: &'a Path,
-    /// Seconds until the playback begins, and its length.
-    starts_in_secs: f64,
-    seconds: f64,
-    devices: &'a [String],
-}
 
 /// Starts the devices, and waits for Ctrl-C.
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
@@ -56,13 +42,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Ok(Exit::Done);
     };
     if args.json {
-        print::report_json(&ReadyEvent {
-            event: "ready",
-            rig: &emulation.rig_file,
-            starts_in_secs: args.start_in,
-            seconds: args.seconds,
-            devices: &emulation.descriptions,
-        })?;
+        print::report_json(&emulation.ready_event(&plan))?;
     } else {
         for device in &emulation.descriptions {
             print::report(device);
