@@ -24,14 +24,15 @@ pub(crate) fn serve_stored<'a>(
         return;
     };
     let page_from_model = model_from_page.inverse();
-    hub.set_keyframe_reader(Arc::new(move |camera: &str, stamp: Stamp| {
-        let keyframe = stored.read_one(camera, stamp);
-        let in_page = |keyframe: Keyframe| Keyframe {
-            world_from_camera: page_from_model * keyframe.world_from_camera,
-            ..keyframe
-        };
-        keyframe
-            .map(|keyframe| keyframe.map(in_page))
-            .map_err(|error| format!("{error:#}"))
-    }));
+    hub.keyframes()
+        .set_reader(Arc::new(move |camera: &str, stamp: Stamp| {
+            let keyframe = stored.read_one(camera, stamp);
+            let in_page = |keyframe: Keyframe| Keyframe {
+                world_from_camera: page_from_model * keyframe.world_from_camera,
+                ..keyframe
+            };
+            keyframe
+                .map(|keyframe| keyframe.map(in_page))
+                .map_err(|error| format!("{error:#}"))
+        }));
 }

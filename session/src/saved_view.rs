@@ -90,7 +90,7 @@ fn publish_saved(
     if let Some(view) = first_view(&cameras, bounds, model_from_page) {
         view.publish(hub);
     }
-    hub.set_keyframes(cameras);
+    hub.keyframes().set(cameras);
     hub.set_status(status);
     let mut files = served_files::of_models(kinds.iter().copied().zip(paths));
     files.extend(incident_view::publish(hub, paths, model_from_page));

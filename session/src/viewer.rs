@@ -78,7 +78,7 @@ impl ModelViewer {
                 .collect(),
             models,
             chunk_publisher: ChunkPublisher::new(hub.clone()),
-            cameras: hub.keyframe_poses().into_iter().map(posed).collect(),
+            cameras: hub.keyframes().poses().into_iter().map(posed).collect(),
             observation_publisher: ObservationPublisher::new(hub.clone()),
             hub,
             model_from_page: Transform::identity(),

@@ -54,6 +54,7 @@ pub use steering::state::{
 };
 pub use steering::steering_server::{SteeringServer, publish_steering};
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};
+pub use topics::keyframes::PublishedKeyframes;
 pub use topics::model_chunks::PublishedChunks;
 pub use topics::observations::{ObservationMap, ObservedCell};
 pub use topics::operator_status::{

@@ -2,6 +2,7 @@
 
 mod clearance;
 mod growing_scene;
+mod keyframe_intake;
 mod keyframe_warning;
 mod keyframes;
 mod models;
@@ -20,8 +21,8 @@ use background::Task;
 use capture::{Feed, InputResult, Notes};
 use growing_scene::GrowingScene;
 use keyframe::Keyframe;
-use keyframe_warning::KeyframeWarning;
-use keyframes::AcceptedKeyframes;
+pub use keyframe_intake::KeyframeChange;
+use keyframe_intake::KeyframeIntake;
 use models::Models;
 use publishing::Publishing;
 use requests::Requests;
@@ -61,28 +62,19 @@ impl Pace {
 /// A live run.
 pub struct LiveLoop {
     models: Models,
-    feed: Feed,
+    intake: KeyframeIntake,
     hub: Hub,
     pace: Pace,
-    start_keyframes: usize,
-    accepted: AcceptedKeyframes,
     scene: GrowingScene,
     budget: RenderBudget,
     recoveries: Recoveries,
     /// Times of the keyframes.
     ledger: Ledger,
-    keyframe_change: Option<KeyframeChange>,
     /// Receives drawn depth, if an arm is steered.
     clearance: Option<ClearanceFeed>,
     requests: Requests,
     publishing: Publishing,
-    keyframe_warning: KeyframeWarning,
-    /// Number of images that did not become keyframes in earlier parts of the run, by reason.
-    earlier_rejected: BTreeMap<String, u64>,
 }
-
-/// Changes a keyframe before the models receive it.
-pub type KeyframeChange = Box<dyn FnMut(Arc<Keyframe>) -> Arc<Keyframe>>;
 
 impl LiveLoop {
     /// Combines the parts. Training starts with the first call of [`Self::advance`].
@@ -92,7 +84,7 @@ impl LiveLoop {
             .is_some_and(|session| session.gpu().is_software());
         Self {
             models: Models::new(sessions),
-            feed,
+            intake: KeyframeIntake::new(feed, options.start_keyframes, options.earlier_rejected),
             publishing: Publishing::new(
                 hub.clone(),
                 options.identity,
@@ -101,33 +93,28 @@ impl LiveLoop {
             ),
             hub,
             pace: options.pace,
-            start_keyframes: options.start_keyframes,
-            accepted: AcceptedKeyframes::default(),
             scene: GrowingScene::default(),
             budget: RenderBudget::new(is_software),
             recoveries: Recoveries::new(options.open_gpu),
             ledger: Ledger::default(),
-            keyframe_change: None,
             clearance: None,
             requests: Requests::default(),
-            keyframe_warning: KeyframeWarning::start(),
-            earlier_rejected: options.earlier_rejected,
         }
     }
 
     /// Continues with the keyframes of an earlier run, which the sessions already hold.
     pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
-        self.accepted.list = keyframes;
+        self.intake.accepted.list = keyframes;
         self.publishing
-            .publish_keyframes(&self.accepted.list, &self.models.sessions[0]);
-        self.scene.publish(&self.accepted.list, &self.hub);
+            .publish_keyframes(&self.intake.accepted.list, &self.models.sessions[0]);
+        self.scene.publish(&self.intake.accepted.list, &self.hub);
         self
     }
 
     /// Changes all following keyframes before the models receive them, for benchmarks with
     /// disturbed data.
     pub fn change_keyframes(&mut self, change: KeyframeChange) {
-        self.keyframe_change = Some(change);
+        self.intake.change = Some(change);
     }
 
     /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or
@@ -138,14 +125,12 @@ impl LiveLoop {
         }
         // After one session has reached its limit, the run waits for all other sessions that can
         // still reach theirs.
-        let is_done =
-            |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let is_done = |session: &Session| {
+            session.is_over() || (self.intake.feed.ended() && session.is_idle())
+        };
         let sessions = &self.models.sessions;
         let reached = sessions.iter().any(Session::is_over) && sessions.iter().all(is_done);
-        reached
-            || self.has_exhausted_input()
-            || self.feed.source_failed()
-            || (self.feed.ended() && !self.accepted.can_train())
+        reached || self.has_exhausted_input() || self.intake.is_over_without_data()
     }
 
     /// Whether the input has ended and a model cannot reach its step limit without more keyframes.
@@ -161,12 +146,12 @@ impl LiveLoop {
 
     /// Keyframes in the store, in order of acceptance.
     pub fn keyframes(&self) -> &[Arc<Keyframe>] {
-        &self.accepted.list
+        &self.intake.accepted.list
     }
 
     /// Number of keyframes evicted so far.
     pub fn n_evicted(&self) -> u64 {
-        self.accepted.n_evicted
+        self.intake.accepted.n_evicted
     }
 
     /// Times at which each keyframe passed the stages from the camera to the screens of viewers.
@@ -181,9 +166,7 @@ impl LiveLoop {
 
     /// Runs one cycle: takes keyframes, trains, draws and publishes. Reopens the GPU if it fails.
     pub fn advance(&mut self) -> anyhow::Result<()> {
-        if self.accepted.list.is_empty() {
-            self.keyframe_warning.warn_when_due(&self.feed);
-        }
+        self.intake.warn_if_empty();
         // Requests of operators come first, so that the pictures and the status of this cycle
         // already show their effect.
         self.requests.apply_controls(&self.hub, &mut self.models);
@@ -233,7 +216,7 @@ impl LiveLoop {
             .sessions
             .iter()
             .try_for_each(|session| session.gpu().check())?;
-        if !self.is_training() {
+        if !self.intake.has_enough() {
             return Ok(());
         }
         // One image per cycle, so that requested pictures are drawn between two images.
@@ -276,7 +259,7 @@ impl LiveLoop {
             .for_each(|session| session.viewed().set_watched(is_watched));
         // In lockstep, no model trains beyond the step at which its next keyframe is due. After the
         // end of the input, no keyframe is due any more.
-        let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
+        let is_paced = self.pace != Pace::RealTime && !self.intake.feed.ended();
         // Growth is paused only in real time. The time of a step differs between runs, and a
         // lockstep run must not depend on it.
         if self.pace == Pace::RealTime {
@@ -313,10 +296,10 @@ impl LiveLoop {
             viewers.show("saving", closing);
         }
         let Self {
-            mut models, feed, ..
+            mut models, intake, ..
         } = self;
         // The input ends on its own thread, which may still write a recording.
-        let ending = Task::start("end of the input", || feed.finish());
+        let ending = Task::start("end of the input", || intake.feed.finish());
         while !ending.is_finished() {
             models.serve_waiting(&mut viewers);
         }
@@ -330,15 +313,10 @@ impl LiveLoop {
         }
     }
 
-    fn is_training(&self) -> bool {
-        let has_enough = self.accepted.list.len() >= self.start_keyframes || self.feed.ended();
-        self.accepted.can_train() && has_enough
-    }
-
     /// Whether the input has ended and all training is done. The models stay visible until the user
     /// ends the run.
     fn is_finished(&self) -> bool {
-        self.feed.ended() && self.models.is_idle()
+        self.intake.feed.ended() && self.models.is_idle()
     }
 
     /// Progress of the work that [`Self::state`] names.
@@ -347,30 +325,10 @@ impl LiveLoop {
             let text = format!("scoring {n_scored} of {n_all} test images");
             return Some(StateProgress::of_parts(text, n_scored, n_all));
         }
-        if self.is_finished() || self.is_training() {
+        if self.is_finished() || self.intake.has_enough() {
             return None;
         }
-        let n_keyframes = self.accepted.list.len();
-        let progress = if self.feed.first_image().is_none() {
-            StateProgress {
-                text: "no image has arrived yet".to_owned(),
-                ..StateProgress::default()
-            }
-        } else {
-            let n_start = self.start_keyframes.max(1);
-            let n_rejected: u64 = self.feed.rejected().values().sum();
-            // Before the first keyframe, rejected images are the only sign that images arrive.
-            let rejected = match (n_keyframes, n_rejected) {
-                (_, 0) | (1.., _) => String::new(),
-                (0, n) => format!("; {} rejected", messages::counted(n, "image")),
-            };
-            let text = format!(
-                "{} of {n_start} keyframes{rejected}",
-                n_keyframes.min(n_start)
-            );
-            StateProgress::of_parts(text, n_keyframes, n_start)
-        };
-        Some(progress.at_startup())
+        Some(self.intake.progress().at_startup())
     }
 
     fn state(&self) -> RunState {
@@ -378,9 +336,9 @@ impl LiveLoop {
             RunState::Finished
         } else if self.requests.is_paused {
             RunState::Paused
-        } else if self.is_training() {
+        } else if self.intake.has_enough() {
             RunState::Training
-        } else if self.feed.first_image().is_some() {
+        } else if self.intake.feed.first_image().is_some() {
             RunState::Collecting
         } else {
             RunState::Waiting

@@ -68,7 +68,7 @@ impl LiveLoop {
     /// Draws requested pictures as long as training keeps its share of the time.
     pub(super) fn render(&mut self) -> anyhow::Result<()> {
         let started = Instant::now();
-        if !self.is_training() || self.models.is_idle() || self.requests.is_paused {
+        if !self.intake.has_enough() || self.models.is_idle() || self.requests.is_paused {
             self.budget.refill(); // Training is idle, so drawing does not delay it.
         }
         while started.elapsed() < MAX_RENDER_TIME && self.budget.is_picture_due(&self.hub) {
@@ -109,7 +109,7 @@ impl LiveLoop {
         let mut queued = Vec::new();
         let mut is_any_on_gpu = false;
         while let Some(pending) = self.hub.pictures().next_request() {
-            if self.accepted.list.is_empty() {
+            if self.intake.accepted.list.is_empty() {
                 pending.fail("no keyframe yet");
                 continue;
             }
@@ -138,7 +138,7 @@ impl LiveLoop {
     /// With several models, the next model would have to be chosen. In lockstep, the loop would
     /// have to check whether a keyframe is due.
     fn queue_steps(&mut self) -> anyhow::Result<()> {
-        let is_training = self.is_training()
+        let is_training = self.intake.has_enough()
             && !self.models.is_idle()
             && !self.models.is_scoring()
             && !self.requests.is_paused;

@@ -1,7 +1,9 @@
 //! Publishes keyframes, models and the status of a run to viewers.
 
 use super::LiveLoop;
-use crate::advice::{Advisor, ImageFlow, Situation};
+use super::keyframe_intake::KeyframeIntake;
+use super::requests::Requests;
+use crate::advice::{Advisor, Situation};
 use crate::chunk_publisher::ChunkPublisher;
 use crate::ledger::Ledger;
 use crate::observations::{ModelState, ObservationPublisher, PosedKeyframe};
@@ -12,13 +14,10 @@ use calibration::CalibratedCamera;
 use capture::Notes;
 use keyframe::Keyframe;
 use kinematics::Transform;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::RenderRequest;
-use viz::{
-    Hub, Identity, ImageCounts, KeyframePose, KeyframeStore, ModelStatus, OperatorStatus, Status,
-};
+use viz::{Hub, Identity, KeyframePose, ModelStatus, OperatorStatus, Status};
 
 /// Period of status messages. With a shorter period, the numbers of the page would be harder to
 /// read, and more data would be sent. With a longer period, the results of controls and edits would
@@ -92,8 +91,8 @@ impl Publishing {
                 .map(|(keyframe, camera)| camera_correction(keyframe, camera))
                 .collect(),
         );
-        self.hub.set_keyframe_sources(keyframes);
-        self.hub.set_keyframes(
+        self.hub.keyframes().set_sources(keyframes);
+        self.hub.keyframes().set(
             posed()
                 .map(|(keyframe, camera)| frustum(keyframe, camera))
                 .collect(),
@@ -137,6 +136,38 @@ impl Publishing {
         let render = |request: &RenderRequest| session.viewed().render(request);
         self.observations.publish(&keyframes, &model, render)
     }
+
+    /// What the operator's header shows.
+    fn operator_status(
+        &mut self,
+        state: RunState,
+        intake: &KeyframeIntake,
+        requests: &Requests,
+    ) -> OperatorStatus {
+        // After the end of the input, a run can be finished although training is still paused.
+        let paused_by = requests.paused_by.filter(|_| state == RunState::Paused);
+        let counts = intake.counts();
+        let situation = Situation {
+            state,
+            has_input_ended: intake.feed.source_ended(),
+            run_secs: self.started.elapsed().as_secs_f64(),
+            recent: self.recent_images.push(Instant::now(), counts.flow),
+            store: counts.store,
+            start_keyframes: intake.start_keyframes,
+            paused_by,
+        };
+        OperatorStatus {
+            identity: Some(self.identity.clone()),
+            advice: Some(self.advisor.advise(&situation)),
+            input_ended: situation.has_input_ended,
+            images: Some(counts.images),
+            store: Some(counts.shown_store),
+            paused_by,
+            checkpoint: requests.checkpoint(),
+            infos: requests.infos().collect(),
+            ..OperatorStatus::default()
+        }
+    }
 }
 
 impl LiveLoop {
@@ -149,12 +180,14 @@ impl LiveLoop {
                     .add_render(session.viewed().publish_chunks(&mut self.publishing.chunks));
             }
         }
-        let is_idle = !self.is_training() || self.models.is_scoring();
+        let is_idle = !self.intake.has_enough() || self.models.is_scoring();
         if !is_idle && self.budget.may_render() {
             let session = &mut self.models.sessions[0];
-            let spent =
-                self.publishing
-                    .publish_observations(&self.accepted.list, session, &self.ledger);
+            let spent = self.publishing.publish_observations(
+                &self.intake.accepted.list,
+                session,
+                &self.ledger,
+            );
             self.budget.add_render(spent);
         }
     }
@@ -187,29 +220,32 @@ impl LiveLoop {
             self.publishing.scoring_time += before.elapsed();
             self.budget.add_training(before.elapsed());
             self.publishing
-                .publish_moved_keyframes(&self.accepted.list, &self.models.sessions[0]);
+                .publish_moved_keyframes(&self.intake.accepted.list, &self.models.sessions[0]);
         }
         self.publish_status();
         Ok(())
     }
 
     pub(super) fn publish_status(&mut self) {
-        let rejected = sum_by_reason(&self.earlier_rejected, &self.feed.rejected());
+        let rejected = self.intake.rejected();
         for session in &mut self.models.sessions {
             session.persistence().set_rejected(&rejected);
         }
         self.requests.update_checkpoint(&mut self.models);
-        let operator = self.operator_status();
+        let state = self.state();
+        let operator = self
+            .publishing
+            .operator_status(state, &self.intake, &self.requests);
         let sessions = &self.models.sessions;
         let movements = sessions[0]
             .alignment()
             .map_or(&[][..], |alignment| &alignment.movements[..]);
         let mut models = sessions.iter().map(model_status);
         self.hub.set_status(Status {
-            state: self.state().name().to_owned(),
+            state: state.name().to_owned(),
             progress: self.state_progress(),
             seconds: sessions[0].time().secs(),
-            keyframes: self.accepted.list.len() as u64,
+            keyframes: self.intake.accepted.list.len() as u64,
             rejected,
             model: models.next().unwrap_or_default(),
             others: models.collect(),
@@ -225,65 +261,6 @@ impl LiveLoop {
             ..Status::default()
         });
     }
-
-    /// What the operator's header shows.
-    fn operator_status(&mut self) -> OperatorStatus {
-        let counts = self.feed.counts();
-        let store = counts.store;
-        let total = ImageFlow {
-            received: counts.images,
-            dropped: counts.dropped,
-            accepted: counts.accepted,
-            rejected: self.feed.rejected(),
-        };
-        let state = self.state();
-        // After the end of the input, a run can be finished although training is still paused.
-        let paused_by = (self.requests.paused_by).filter(|_| state == RunState::Paused);
-        let situation = Situation {
-            state,
-            has_input_ended: self.feed.source_ended(),
-            run_secs: self.publishing.started.elapsed().as_secs_f64(),
-            recent: self.publishing.recent_images.push(Instant::now(), total),
-            store,
-            start_keyframes: self.start_keyframes,
-            paused_by,
-        };
-        OperatorStatus {
-            identity: Some(self.publishing.identity.clone()),
-            advice: Some(self.publishing.advisor.advise(&situation)),
-            input_ended: situation.has_input_ended,
-            images: Some(ImageCounts {
-                received: counts.images,
-                dropped: counts.dropped,
-                accepted: counts.accepted,
-                evicted: counts.evicted,
-            }),
-            store: Some(KeyframeStore {
-                keyframes: store.keyframes as u64,
-                max_keyframes: store.max_keyframes as u64,
-                bytes: store.bytes,
-                max_bytes: store.max_bytes,
-                is_full: store.is_full(),
-            }),
-            paused_by,
-            checkpoint: self.requests.checkpoint(),
-            infos: self.requests.infos().collect(),
-            ..OperatorStatus::default()
-        }
-    }
-}
-
-/// Adds the numbers of rejected images of the earlier parts of a run and of the present one, by
-/// reason.
-fn sum_by_reason(
-    earlier: &BTreeMap<String, u64>,
-    present: &BTreeMap<String, u64>,
-) -> BTreeMap<String, u64> {
-    let mut sums = earlier.clone();
-    for (reason, n) in present {
-        *sums.entry(reason.clone()).or_default() += n;
-    }
-    sums
 }
 
 /// Name of a keyframe's camera, and the correction of its pose: the corrected camera in the frame

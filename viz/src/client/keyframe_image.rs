@@ -8,7 +8,7 @@ use crate::client::server_message::{
 use crate::pictures::jpeg::{Chroma, JpegError, Layout, Pixels, downscale, encode};
 use crate::pictures::view_request::InvalidRequest;
 use crate::pose::row_major;
-use crate::topics::keyframes::SharedLog;
+use crate::topics::keyframes::{PublishedKeyframes, SharedLog};
 use crate::topics::published_data::KeyframePose;
 use crate::topics::subscriptions::fitted;
 use flate2::Compression;
@@ -128,7 +128,7 @@ fn listed(hub: &Hub, number: u64) -> Result<KeyframePose, KeyframeImageError> {
 
 /// The keyframe in memory, or else on disk.
 fn source(hub: &Hub, pose: &KeyframePose) -> Result<Arc<Keyframe>, KeyframeImageError> {
-    if let Some(keyframe) = hub.keyframe_source(&pose.camera, pose.stamp) {
+    if let Some(keyframe) = hub.keyframes().source(&pose.camera, pose.stamp) {
         return Ok(keyframe);
     }
     let KeyframeReader(reader) = hub.latest::<KeyframeReader>().borrow().clone();
@@ -137,12 +137,12 @@ fn source(hub: &Hub, pose: &KeyframePose) -> Result<Arc<Keyframe>, KeyframeImage
     keyframe.map(Arc::new).ok_or(KeyframeImageError::NotStored)
 }
 
-impl Hub {
-    /// Sets how keyframes are read that [`Self::set_keyframe_sources`] has not set, or that are no
-    /// longer in memory. It is called on threads for blocking tasks. The poses of the keyframes
-    /// that it reads are in the page's world.
-    pub fn set_keyframe_reader(&self, read: Arc<ReadKeyframe>) {
-        self.latest().send_replace(KeyframeReader(Some(read)));
+impl PublishedKeyframes<'_> {
+    /// Sets the function that reads keyframes which are not in memory: those that
+    /// [`Self::set_sources`] has not set, and those that were dropped since. The function is called
+    /// on threads for blocking tasks. The poses of its keyframes are in the page's world.
+    pub fn set_reader(&self, read: Arc<ReadKeyframe>) {
+        self.hub.latest().send_replace(KeyframeReader(Some(read)));
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::Hub;
 use crate::client::server_message::{BinaryHeader, PointsHeader, frame};
-use crate::topics::keyframes::SharedLog;
+use crate::topics::keyframes::{PublishedKeyframes, SharedLog};
 use crate::topics::positions::pack_positions;
 use crate::topics::{
     ClientState, DefaultRate, EncodeContext, Feed, Priority, Publisher, Timer, Topic, TopicEntry,
@@ -99,7 +99,7 @@ impl Topic for PointTopic {
         points.is_running = true;
         // `None` if the run has dropped the keyframe in the meantime. The keyframe then counts as
         // one without points, and is not looked up again.
-        let source = context.hub.keyframe_source(&pose.camera, pose.stamp);
+        let source = context.hub.keyframes().source(&pose.camera, pose.stamp);
         let task = PackingTask {
             number,
             points: Arc::clone(&self.points),
@@ -204,20 +204,22 @@ impl Feed for PointFeed {
     }
 }
 
-impl Hub {
+impl PublishedKeyframes<'_> {
     /// Sets the keyframes of which clients can draw points. They are not kept alive.
-    pub fn set_keyframe_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
+    pub fn set_sources<'a>(&self, keyframes: impl IntoIterator<Item = &'a Arc<Keyframe>>) {
         let key = |keyframe: &Keyframe| (Arc::clone(&keyframe.camera), keyframe.stamp.0);
         let sources = keyframes
             .into_iter()
             .map(|keyframe| (key(keyframe), Arc::downgrade(keyframe)));
-        self.latest::<KeyframeSources>()
+        self.hub
+            .latest::<KeyframeSources>()
             .send_replace(sources.collect());
     }
 
     /// The keyframe with this camera and stamp, if the run still has it.
-    pub(crate) fn keyframe_source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
-        self.latest::<KeyframeSources>()
+    pub(crate) fn source(&self, camera: &Arc<str>, stamp: Stamp) -> Option<Arc<Keyframe>> {
+        self.hub
+            .latest::<KeyframeSources>()
             .borrow()
             .get(&(Arc::clone(camera), stamp.0))?
             .upgrade()

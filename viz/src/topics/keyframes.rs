@@ -241,14 +241,29 @@ impl KeyframeFeed {
 }
 
 impl Hub {
-    /// Replaces the keyframe frustums. Call this when the keyframes have changed.
-    pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
-        self.latest::<KeyframePoses>()
+    /// The keyframes.
+    pub fn keyframes(&self) -> PublishedKeyframes<'_> {
+        PublishedKeyframes { hub: self }
+    }
+}
+
+/// The keyframes in a hub: their frustums, and where clients get their photographs and points from.
+#[derive(Clone, Copy, Debug)]
+pub struct PublishedKeyframes<'a> {
+    pub(crate) hub: &'a Hub,
+}
+
+impl PublishedKeyframes<'_> {
+    /// Replaces the frustums. Call this when the keyframes have changed.
+    pub fn set(&self, keyframes: Vec<KeyframePose>) {
+        self.hub
+            .latest::<KeyframePoses>()
             .send_replace(keyframes.into());
     }
 
-    /// The keyframe frustums.
-    pub fn keyframe_poses(&self) -> Vec<KeyframePose> {
-        self.latest::<KeyframePoses>().borrow().to_vec()
+    /// The frustums.
+    #[must_use]
+    pub fn poses(&self) -> Vec<KeyframePose> {
+        self.hub.latest::<KeyframePoses>().borrow().to_vec()
     }
 }
