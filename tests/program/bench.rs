@@ -1,6 +1,7 @@
 //! Tests `fieldrig bench curve`, `budget`, `ablation` and `stability` as users run them, on a scene
 //! of a few tiny photos.
 
+use crate::command::assert_one_error;
 use image::RgbImage;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -71,21 +72,7 @@ fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
 
 /// Asserts that a bench fails with one error message that contains all `words`.
 fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
-    let output = bench(folder, args);
-    let printed = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
-    assert!(
-        words.iter().all(|word| printed.contains(word)),
-        "{args:?}: {printed}"
-    );
-    assert_eq!(
-        printed
-            .lines()
-            .filter(|line| line.starts_with("error: "))
-            .count(),
-        1,
-        "{printed}"
-    );
+    assert_one_error(args, &bench(folder, args), code, words);
 }
 
 fn assert_chart(folder: &Path, name: &str) {

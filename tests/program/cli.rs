@@ -1,5 +1,6 @@
 //! Tests the command line: help, exit codes, and one clear error message for invalid input.
 
+use crate::command::assert_one_error;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
@@ -46,21 +47,7 @@ fn stderr(output: &Output) -> String {
 
 /// Asserts the exit code and one error message on stderr that contains all `words`.
 fn assert_fails_with(args: &[&str], code: i32, words: &[&str]) {
-    let output = fieldrig(args);
-    let printed = stderr(&output);
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
-    assert!(!printed.contains("panicked"), "{args:?}: {printed}");
-    for word in words {
-        assert!(
-            printed.contains(word),
-            "{args:?} does not mention {word:?}: {printed}"
-        );
-    }
-    let sentences: Vec<&str> = printed
-        .lines()
-        .filter(|line| line.starts_with("error: "))
-        .collect();
-    assert_eq!(sentences.len(), 1, "{args:?}: {printed}");
+    assert_one_error(args, &fieldrig(args), code, words);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Tests edits end to end: erased space is not drawn in `view` and in live runs, and is saved,
 //! exported, resumed and undone.
 
+use crate::pictures::difference;
 #[cfg(feature = "sim")]
 use crate::small_rig;
 use crate::wall;
@@ -203,17 +204,6 @@ fn n_edits_of(status: &Value, method: &str) -> Option<u64> {
         .chain(others)
         .find(|model| model["method"] == method)?["edits"]
         .as_u64()
-}
-
-/// Mean difference of the colors of two pictures, on a scale of 0 to 255.
-fn difference(a: &image::RgbImage, b: &image::RgbImage) -> f64 {
-    let sum: f64 = a
-        .as_raw()
-        .iter()
-        .zip(b.as_raw())
-        .map(|(a, b)| f64::from(a.abs_diff(*b)))
-        .sum();
-    sum / a.as_raw().len() as f64
 }
 
 /// Mean brightness of 10x10 pixels around a position, on a scale of 0 to 255.

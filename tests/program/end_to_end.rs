@@ -321,6 +321,31 @@ fn live_bench_repeats_a_recording() {
     );
 }
 
+/// Runs a simulation into the folder `live`, replays its recording into the folder `replay`, and
+/// checks that both models are the same. Returns the last event of the live run.
+fn live_and_replay(folder: &Path, common: &[&str], steps_per_keyframe: &str) -> Value {
+    let pace = ["--steps-per-keyframe", steps_per_keyframe];
+    let run = [&pace, &["--listen", "127.0.0.1:0"], common].concat();
+    let live = [
+        "run",
+        "rig.toml",
+        "--sim",
+        "--record",
+        "scan.mcap",
+        "--out",
+        "live",
+    ];
+    let done = events(folder, &[&live[..], &run].concat())
+        .pop()
+        .expect("events");
+    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
+    let replayed = events(folder, &[&replay[..], &run].concat())
+        .pop()
+        .expect("events");
+    assert_eq!(replayed["checkpoint_sha256"], done["checkpoint_sha256"]);
+    done
+}
+
 /// Number of keyframes to fuse.
 const N_FUSED: &str = "10";
 /// The measured PSNR is 18 dB, because regions that are not observed yet have no surface.
@@ -332,33 +357,11 @@ fn tsdf_runs_live_replays_and_resumes() {
     let folder = folder.path();
     rig_file(folder);
     let common = ["--method", "tsdf", "--json", "--steps", N_FUSED];
-    let run = [
-        &["--steps-per-keyframe", "1", "--listen", "127.0.0.1:0"],
-        &common[..],
-    ]
-    .concat();
-    let live = [
-        "run",
-        "rig.toml",
-        "--sim",
-        "--record",
-        "scan.mcap",
-        "--out",
-        "live",
-    ];
-    let printed = events(folder, &[&live[..], &run].concat());
-    let done = printed.last().expect("events");
-    let psnr = number(done, "psnr");
+    let done = live_and_replay(folder, &common, "1");
+    let psnr = number(&done, "psnr");
     assert!(psnr >= MIN_PSNR_OF_MESH, "test PSNR {psnr:.2} dB");
-    assert!(number(done, "depth_rmse_m") < 0.05, "{done}");
-    assert!(number(done, "surface_error_m") < 0.004, "{done}");
-
-    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
-    let replayed = events(folder, &[&replay[..], &run].concat());
-    assert_eq!(
-        replayed.last().expect("events")["checkpoint_sha256"],
-        done["checkpoint_sha256"]
-    );
+    assert!(number(&done, "depth_rmse_m") < 0.05, "{done}");
+    assert!(number(&done, "surface_error_m") < 0.004, "{done}");
     let mesh = std::fs::read(folder.join("live/mesh.glb")).expect("a mesh");
     // A run on a recording continues with the recording, and not with the devices.
     for (run, command) in [
@@ -436,32 +439,10 @@ fn nerf_runs_live_replays_and_resumes() {
     rig_file(folder);
     let n_steps = n_nerf_steps();
     let common = ["--method", "nerf", "--json", "--steps", n_steps];
-    let run = [
-        &["--steps-per-keyframe", "8", "--listen", "127.0.0.1:0"],
-        &common[..],
-    ]
-    .concat();
-    let live = [
-        "run",
-        "rig.toml",
-        "--sim",
-        "--record",
-        "scan.mcap",
-        "--out",
-        "live",
-    ];
-    let printed = events(folder, &[&live[..], &run].concat());
-    let done = printed.last().expect("events");
-    let psnr = number(done, "psnr");
+    let done = live_and_replay(folder, &common, "8");
+    let psnr = number(&done, "psnr");
     assert!(psnr >= MIN_NERF_PSNR, "test PSNR {psnr:.2} dB");
     assert_eq!(done["steps"].as_u64(), n_steps.parse().ok());
-
-    let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
-    let replayed = events(folder, &[&replay[..], &run].concat());
-    assert_eq!(
-        replayed.last().expect("events")["checkpoint_sha256"],
-        done["checkpoint_sha256"]
-    );
     check_saved_model_scores(folder, psnr);
     check_saved_model_renders(folder);
 

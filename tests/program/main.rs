@@ -34,6 +34,7 @@ mod page_replay;
 mod page_server;
 mod paths;
 mod photos;
+mod pictures;
 mod preview;
 #[cfg(feature = "realsense")]
 mod realsense;

@@ -1,6 +1,7 @@
 //! Tests several methods that train in parallel on the same images: each gives the same result as
 //! alone, in its own folder.
 
+use crate::command::assert_one_error;
 use crate::wall;
 use crate::wall::fieldrig;
 use serde_json::{Value, json};
@@ -33,21 +34,7 @@ fn done_events(printed: &[Value]) -> Vec<&Value> {
 }
 
 fn assert_fails_with(folder: &Path, args: &[&str], words: &[&str]) {
-    let output = fieldrig(folder, args);
-    let printed = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(2), "{args:?}: {printed}");
-    assert!(
-        words.iter().all(|word| printed.contains(word)),
-        "{args:?}: {printed}"
-    );
-    assert_eq!(
-        printed
-            .lines()
-            .filter(|line| line.starts_with("error: "))
-            .count(),
-        1,
-        "{printed}"
-    );
+    assert_one_error(args, &fieldrig(folder, args), 2, words);
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! Tests `fieldrig view` and the report page of training: what a browser receives, and which
 //! requests are rejected.
 
+use crate::command::assert_one_error;
+use crate::pictures::difference;
 use crate::wall;
 use crate::wall::fieldrig;
 use gpu::{Gpu, GpuOptions};
@@ -277,18 +279,6 @@ fn rendered(folder: &Path, model: &str, pose: &[f64], out: &str) -> image::RgbIm
         .into_rgb8()
 }
 
-/// Mean difference of the colors of two pictures, on a scale of 0 to 255.
-fn difference(a: &image::RgbImage, b: &image::RgbImage) -> f64 {
-    assert_eq!(a.dimensions(), b.dimensions());
-    let sum: f64 = a
-        .as_raw()
-        .iter()
-        .zip(b.as_raw())
-        .map(|(a, b)| f64::from(a.abs_diff(*b)))
-        .sum();
-    sum / a.as_raw().len() as f64
-}
-
 /// Mean brightness, on a scale of 0 to 255.
 fn brightness(picture: &image::RgbImage) -> f64 {
     picture
@@ -473,21 +463,7 @@ fn check_view_without_cameras(folder: &Path) {
 
 /// Asserts the exit code and one error message on stderr that contains all `words`.
 fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
-    let output = fieldrig(folder, args);
-    let printed = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
-    assert!(
-        words.iter().all(|word| printed.contains(word)),
-        "{args:?}: {printed}"
-    );
-    assert_eq!(
-        printed
-            .lines()
-            .filter(|line| line.starts_with("error: "))
-            .count(),
-        1,
-        "{args:?}: {printed}"
-    );
+    assert_one_error(args, &fieldrig(folder, args), code, words);
 }
 
 #[test]

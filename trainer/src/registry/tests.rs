@@ -1,9 +1,13 @@
 //! Rules that every registered method must follow.
 
 use super::*;
+use crate::aligned::AlignedModel;
 use crate::{CommonOptions, ModelSpec, load, resume, resume_without_missing, test_scenes};
+use gpu::Gpu;
 use gpu::testing::test_gpu;
+use keyframe::Keyframe;
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 #[test]
 fn names_files_and_extensions_are_unique() {
@@ -87,22 +91,26 @@ fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
     }
 }
 
+/// A model after two steps.
+fn trained(kind: ModelKind, gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> AlignedModel {
+    let spec = ModelSpec::new(kind, CommonOptions::default(), &[]).unwrap();
+    let mut model = spec.start(gpu.clone()).unwrap();
+    for keyframe in keyframes {
+        model.push(keyframe.clone()).unwrap();
+    }
+    while model.model().progress().step < 2 {
+        model.step(1).unwrap();
+    }
+    model
+}
+
 /// A live run deletes the files of removed keyframes when it writes the next checkpoint.
 #[test]
 fn removed_keyframe_is_not_needed_to_resume() {
     let gpu = test_gpu();
     let keyframes = test_scenes::ring(&[test_scenes::floor()], nalgebra::Point3::origin(), 4);
     for kind in ModelKind::ALL {
-        let mut model = ModelSpec::new(*kind, CommonOptions::default(), &[])
-            .unwrap()
-            .start(gpu.clone())
-            .unwrap();
-        keyframes
-            .iter()
-            .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
-        while model.model().progress().step < 2 {
-            model.step(1).unwrap();
-        }
+        let mut model = trained(*kind, &gpu, &keyframes);
         let n_steps = model.model().progress().step;
         model
             .remove(&keyframes[0].camera, keyframes[0].stamp)
@@ -120,16 +128,7 @@ fn every_method_resumes_without_missing_keyframes() {
     let gpu = test_gpu();
     let keyframes = test_scenes::ring(&[test_scenes::floor()], nalgebra::Point3::origin(), 6);
     for kind in ModelKind::ALL {
-        let mut model = ModelSpec::new(*kind, CommonOptions::default(), &[])
-            .unwrap()
-            .start(gpu.clone())
-            .unwrap();
-        keyframes
-            .iter()
-            .for_each(|keyframe| model.push(keyframe.clone()).unwrap());
-        while model.model().progress().step < 2 {
-            model.step(1).unwrap();
-        }
+        let mut model = trained(*kind, &gpu, &keyframes);
         let checkpoint = model.checkpoint().unwrap().finish().unwrap();
         let left = [&keyframes[..1], &keyframes[3..]].concat();
         let error = resume(gpu.clone(), &checkpoint, &left).err().unwrap();

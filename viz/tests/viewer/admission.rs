@@ -2,6 +2,7 @@
 
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
+use crate::local_server::start;
 use flate2::read::GzDecoder;
 use serde_json::{Value, json};
 use std::io::{Read, Write};
@@ -10,7 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use trainer::Picture;
-use viz::{Hub, LiveImage, LivePixels, ModelStatus, RunResult, Server, ServerConfig, Status};
+use viz::{LiveImage, LivePixels, ModelStatus, RunResult, Status};
 
 /// A new viewer receives the page and connects within this time, regardless of other connections.
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
@@ -18,17 +19,6 @@ const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
 const HALF_OPEN_SECS: std::ops::Range<f64> = 2.0..8.0;
 /// A client that never reads is disconnected after 8 s, at the next check.
 const NEVER_READING_SECS: std::ops::Range<f64> = 5.0..16.0;
-
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-        },
-        hub.clone(),
-    );
-    (hub, server.expect("a free port exists"))
-}
 
 fn connect(address: SocketAddr) -> TcpStream {
     let stream = TcpStream::connect(address).expect("the server listens");

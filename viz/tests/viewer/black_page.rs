@@ -6,8 +6,6 @@
 use crate::models::{self, ModelThread, splat_model, tsdf_model, wall};
 use crate::proxy::{Link, Proxy};
 use crate::request_thread::RequestThread;
-use kinematics::Transform;
-use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,7 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use test_support::browser::{Browser, browser_for_page, canvas_shot, wait_for};
 use trainer::{Method, Picture, RenderRequest};
-use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, StateProgress, Status};
+use viz::{Hub, ModelStatus, Server, ServerConfig, StateProgress, Status};
 
 const WINDOW_PX: [u32; 2] = [1100, 720];
 /// Pixels whose channels are at most this value count as black. The background of the view has
@@ -312,23 +310,7 @@ fn local_drawing_keeps_what_is_on_screen_until_its_chunks_are_there() {
         return;
     };
     let hub = Hub::new();
-    let eye = Point3::new(0.5, -2.9, 0.6);
-    let upright = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.0, 0.1) - eye), &-Vector3::z());
-    hub.set_scene_hint(SceneHint {
-        center_m: [0.0, 0.0, 0.1],
-        radius_m: 1.5,
-        world_from_camera: Transform::from_parts(eye.into(), upright),
-    });
-    let status = |method: &str| ModelStatus {
-        method: method.to_owned(),
-        has_chunks: true,
-        ..ModelStatus::default()
-    };
-    hub.set_status(Status {
-        model: status("splat"),
-        others: vec![status("tsdf")],
-        ..Status::default()
-    });
+    models::publish_wall(&hub, Vec::new());
     let splats = wall(40_000);
     let (mut splat, mut tsdf) = (splat_model(&splats), tsdf_model(18));
     let splat_parts = ("splat", n_chunks(&mut splat));

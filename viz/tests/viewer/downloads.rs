@@ -1,6 +1,7 @@
 //! Files that the server offers: names, headers, large files, errors, and pictures meanwhile.
 
 use crate::client::{Client, TIMEOUT};
+use crate::local_server::start;
 use serde_json::json;
 use std::fs::File;
 use std::io::{Read, Write};
@@ -9,19 +10,10 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
-use viz::{Hub, ServedFile, Server, ServerConfig, publish_files};
+use viz::{ServedFile, publish_files};
 
 /// Many pieces, and more than the buffers of a connection hold.
 const LARGE_BYTES: usize = 9_000_001;
-
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let config = ServerConfig {
-        listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-    };
-    let server = Server::start(config, hub.clone()).expect("a free port exists");
-    (hub, server)
-}
 
 /// A file that is opened for each request.
 pub(crate) fn served(name: &str, save_as: Option<&str>, path: PathBuf) -> ServedFile {

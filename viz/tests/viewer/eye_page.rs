@@ -4,6 +4,7 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
+use crate::local_server::serve;
 use crate::request_thread::RequestThread;
 use analytic_scene::draw_boxes;
 use kinematics::Transform;
@@ -15,7 +16,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::{Picture, Projection, RenderRequest};
-use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, ModelStatus, SceneHint, Server, Status};
 
 const WINDOW_PX: [u32; 2] = [900, 440];
 /// Inner sides of the walls, and a pillar in the room: corners, meters.
@@ -147,13 +148,7 @@ impl Page {
                 UnitQuaternion::face_towards(&toward, &-Vector3::z()),
             ),
         });
-        let server = Server::start(
-            ServerConfig {
-                listen: ([127, 0, 0, 1], 0).into(),
-            },
-            hub.clone(),
-        )
-        .expect("a port");
+        let server = serve(&hub);
         let renderer = Renderer::start(hub.clone());
         renderer
             .has_panoramas

@@ -61,7 +61,7 @@ fn publish(hub: &Hub, offset: i64) {
         },
         ..Status::default()
     });
-    hub.set_keyframes(vec![KeyframePose {
+    hub.keyframes().set(vec![KeyframePose {
         camera: "wrist".into(),
         stamp: Stamp(KEYFRAME_STAMP),
         world_from_camera: camera_pose(),

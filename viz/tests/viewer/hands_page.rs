@@ -3,6 +3,7 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
+use crate::local_server::serve;
 use crate::request_thread::RequestThread;
 use crate::robot;
 use analytic_scene::{draw, looking_along_y};
@@ -13,7 +14,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, ModelStatus, SceneHint, Server, Status};
 
 const DESKTOP_PX: [u32; 2] = [1440, 900];
 const PHONE_PX: [u32; 2] = [390, 844];
@@ -86,13 +87,7 @@ impl Page {
             radius_m: 0.8,
             world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
         });
-        let server = Server::start(
-            ServerConfig {
-                listen: ([127, 0, 0, 1], 0).into(),
-            },
-            hub.clone(),
-        )
-        .expect("a free port");
+        let server = serve(&hub);
         let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
         let received = Arc::clone(&requests);
         let renderer = RequestThread::start(hub.clone(), move |pending| {

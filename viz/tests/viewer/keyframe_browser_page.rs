@@ -190,8 +190,8 @@ fn blur(rgba: &mut [u8]) {
 
 /// Publishes the keyframes, and a model that is the scene itself.
 fn publish(hub: &Hub, keyframes: &[Arc<Keyframe>]) {
-    hub.set_keyframe_sources(keyframes);
-    hub.set_keyframes(CASES.iter().map(listed).collect());
+    hub.keyframes().set_sources(keyframes);
+    hub.keyframes().set(CASES.iter().map(listed).collect());
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],
         radius_m: RADIUS_M,
@@ -471,7 +471,7 @@ fn pixel_of(request: &RenderRequest, point: &Point3<f64>) -> [f64; 2] {
 
 /// Keyframes whose photographs are not stored are shown with the model only.
 fn check_missing_photograph(browser: &mut Browser, hub: &Hub) {
-    hub.set_keyframe_sources([]);
+    hub.keyframes().set_sources([]);
     press(browser, "ArrowLeft");
     wait_for(browser, "the reason", |browser| {
         let problem = browser.text("keyframe-problem");

@@ -1,15 +1,16 @@
 //! Requests photographs of keyframes from the real server, and compares them with the keyframes.
 
 use crate::client::{Client, part};
+use crate::local_server::start;
 use flate2::read::ZlibDecoder;
 use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Translation3, Vector3};
 use serde_json::{Value, json};
 use std::io::Read;
-use std::net::SocketAddr;
+
 use std::sync::Arc;
-use viz::{Hub, KeyframePose, Server, ServerConfig};
+use viz::{KeyframePose, Server};
 
 const SIZE_PX: [u32; 2] = [64, 48];
 /// Maximum mean difference of a photograph from the keyframe, of 255: JPEG with high quality.
@@ -60,15 +61,6 @@ fn listed(keyframe: &Keyframe) -> KeyframePose {
     }
 }
 
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let config = ServerConfig {
-        listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-    };
-    let server = Server::start(config, hub.clone()).expect("a free port exists");
-    (hub, server)
-}
-
 /// A client that receives changes of the list, and the list.
 fn connect(server: &Server) -> (Client, Vec<Value>) {
     let mut client = Client::connect(server.address());
@@ -107,8 +99,8 @@ fn inflated(bytes: &[u8]) -> Vec<u8> {
 pub(crate) fn header_of_photograph() -> Value {
     let (hub, server) = start();
     let keyframe = Arc::new(photographed(7));
-    hub.set_keyframe_sources([&keyframe]);
-    hub.set_keyframes(vec![listed(&keyframe)]);
+    hub.keyframes().set_sources([&keyframe]);
+    hub.keyframes().set(vec![listed(&keyframe)]);
     let (mut client, keyframes) = connect(&server);
     let number = &keyframes[0]["id"];
     client.send_json(&json!({"type": "keyframe_image", "id": 5, "keyframe": number}));
@@ -119,8 +111,8 @@ pub(crate) fn header_of_photograph() -> Value {
 fn clients_get_the_photograph_of_a_keyframe_with_its_mask_and_facts() {
     let (hub, server) = start();
     let keyframe = Arc::new(photographed(7));
-    hub.set_keyframe_sources([&keyframe]);
-    hub.set_keyframes(vec![listed(&keyframe)]);
+    hub.keyframes().set_sources([&keyframe]);
+    hub.keyframes().set(vec![listed(&keyframe)]);
     let (mut client, keyframes) = connect(&server);
     let number = &keyframes[0]["id"];
 
@@ -169,7 +161,8 @@ fn clients_get_the_photograph_of_a_keyframe_with_its_mask_and_facts() {
 #[test]
 fn keyframes_that_are_not_in_memory_are_read_or_reported() {
     let (hub, server) = start();
-    hub.set_keyframes([7, 8].map(|stamp| listed(&photographed(stamp))).into());
+    hub.keyframes()
+        .set([7, 8].map(|stamp| listed(&photographed(stamp))).into());
     let (mut client, keyframes) = connect(&server);
     let request = |number: &Value| json!({"type": "keyframe_image", "id": 1, "keyframe": number});
     let stored = request(&keyframes[0]["id"]);
@@ -179,10 +172,11 @@ fn keyframes_that_are_not_in_memory_are_read_or_reported() {
     let text = error["message"].as_str().expect("a text");
     assert!(text.contains("not stored"), "{error}");
 
-    hub.set_keyframe_reader(Arc::new(|camera: &str, stamp: Stamp| {
-        assert_eq!(camera, "wrist");
-        Ok((stamp == Stamp(7)).then(|| photographed(7)))
-    }));
+    hub.keyframes()
+        .set_reader(Arc::new(|camera: &str, stamp: Stamp| {
+            assert_eq!(camera, "wrist");
+            Ok((stamp == Stamp(7)).then(|| photographed(7)))
+        }));
     client.send_json(&stored);
     let (header, _) = client.binary_of("keyframe_image");
     assert_eq!(header["stamp_nanos"], json!(7));
@@ -208,14 +202,15 @@ fn keyframes_that_are_not_in_memory_are_read_or_reported() {
 #[test]
 fn a_client_gets_one_photograph_at_a_time() {
     let (hub, server) = start();
-    hub.set_keyframes(vec![listed(&photographed(7))]);
+    hub.keyframes().set(vec![listed(&photographed(7))]);
     let (release, released) = std::sync::mpsc::sync_channel::<()>(1);
     let released = std::sync::Mutex::new(released);
-    hub.set_keyframe_reader(Arc::new(move |_: &str, _: Stamp| {
-        // Returns when the test allows it, or has failed.
-        let _ = released.lock().expect("no panic").recv();
-        Ok(Some(photographed(7)))
-    }));
+    hub.keyframes()
+        .set_reader(Arc::new(move |_: &str, _: Stamp| {
+            // Returns when the test allows it, or has failed.
+            let _ = released.lock().expect("no panic").recv();
+            Ok(Some(photographed(7)))
+        }));
     let (mut client, keyframes) = connect(&server);
     let number = &keyframes[0]["id"];
     for id in [1, 2] {

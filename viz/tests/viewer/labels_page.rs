@@ -525,7 +525,7 @@ fn check_ages(page: &mut Page) {
     });
     // The newest keyframe at the same pose has another color.
     let image = live_image();
-    hub.set_keyframes(vec![KeyframePose {
+    hub.keyframes().set(vec![KeyframePose {
         camera: image.camera,
         stamp: image.stamp,
         world_from_camera: image.world_from_camera.expect("a pose"),

@@ -4,6 +4,7 @@
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 use crate::client::TIMEOUT;
+use crate::local_server::serve;
 use crate::models;
 use crate::models::{ModelThread, splat_model, tsdf_model, wall};
 use crate::page::Camera;
@@ -183,28 +184,11 @@ fn local_drawing_equals_the_pictures_of_the_server() {
         return;
     };
     let hub = Hub::new();
-    // Upright, and not along an axis.
-    let eye = Point3::new(0.5, -2.9, 0.6);
-    let upright = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.0, 0.1) - eye), &-Vector3::z());
-    hub.set_scene_hint(SceneHint {
-        center_m: [0.0, 0.0, 0.1],
-        radius_m: 1.5,
-        world_from_camera: Transform::from_parts(eye.into(), upright),
-    });
-    let status = |method: &str| ModelStatus {
-        method: method.to_owned(),
-        has_chunks: true,
-        ..ModelStatus::default()
-    };
     let nerf = ModelStatus {
         method: "nerf".to_owned(),
         ..ModelStatus::default()
     };
-    hub.set_status(Status {
-        model: status("splat"),
-        others: vec![status("tsdf"), nerf],
-        ..Status::default()
-    });
+    models::publish_wall(&hub, vec![nerf]);
     // More than the page reserves memory for at first.
     let splats = wall(80_000);
     let models: models::Models = vec![
@@ -213,13 +197,7 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     ];
     let (mut reference_splats, mut reference_tsdf) = (splat_model(&splats), tsdf_model(18));
     let thread = ModelThread::start(hub.clone(), models);
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-local-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
@@ -361,13 +339,7 @@ fn local_splats_hide_what_lies_behind_them() {
     splats.sh.fill([0.0; 3]); // Gray.
     let models: models::Models = vec![("splat", Box::new(splat_model(&splats)))];
     let thread = ModelThread::start(hub.clone(), models);
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
         .join(format!("chromium-behind-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), [800, 500]);

@@ -2,6 +2,7 @@
 
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
+use crate::local_server::start;
 use crate::models;
 use crate::models::{ModelThread, splat_model, tsdf_model, wall};
 use crate::proxy::{Link, Proxy};
@@ -11,20 +12,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{ChunkLayout, Method, ModelChunks};
-use viz::{Hub, Server, ServerConfig};
 
 const SUBSCRIPTION: [&str; 3] = ["subscribe", "parts", "model_chunks"];
-
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-        },
-        hub.clone(),
-    );
-    (hub, server.expect("a free port exists"))
-}
 
 /// A client's chunks by id: whether it is coarse, and the payload.
 #[derive(Default)]

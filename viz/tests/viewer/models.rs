@@ -2,6 +2,7 @@
 
 use gpu::{Gpu, GpuOptions};
 use keyframe::scenes::{ball, floor, ring};
+use kinematics::Transform;
 use model_files::splat::arrays::SplatArrays;
 use model_files::splat::cloud::scan_cloud;
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
@@ -11,7 +12,7 @@ use std::time::Duration;
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Method, ModelOptions, Projection, RenderRequest};
-use viz::Hub;
+use viz::{Hub, ModelStatus, SceneHint, Status};
 
 /// A wall of splats at y = 0 that faces -y. Without color coefficients of degree 3, which are not
 /// sent.
@@ -36,6 +37,31 @@ pub(crate) fn wall(n_splats: usize) -> SplatArrays {
         .chunks_exact_mut(16)
         .for_each(|coefficients| coefficients[9..].fill([0.0; 3]));
     splats
+}
+
+/// Publishes a view of the wall, and the status of a splat and a TSDF model that clients can draw.
+///
+/// * `others`: further models.
+pub(crate) fn publish_wall(hub: &Hub, others: Vec<ModelStatus>) {
+    let center = Point3::new(0.0, 0.0, 0.1);
+    // Upright, and not along an axis.
+    let eye = Point3::new(0.5, -2.9, 0.6);
+    let upright = UnitQuaternion::face_towards(&(center - eye), &-Vector3::z());
+    hub.set_scene_hint(SceneHint {
+        center_m: center.into(),
+        radius_m: 1.5,
+        world_from_camera: Transform::from_parts(eye.into(), upright),
+    });
+    let status = |method: &str| ModelStatus {
+        method: method.to_owned(),
+        has_chunks: true,
+        ..ModelStatus::default()
+    };
+    hub.set_status(Status {
+        model: status("splat"),
+        others: [vec![status("tsdf")], others].concat(),
+        ..Status::default()
+    });
 }
 
 pub(crate) fn gpu() -> Arc<Gpu> {

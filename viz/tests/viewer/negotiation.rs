@@ -3,6 +3,7 @@
 use crate::client;
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
+use crate::local_server::start;
 use crate::robot;
 use crate::slow::Slow;
 use kinematics::{Stamp, Transform};
@@ -10,18 +11,7 @@ use serde_json::{Value, json};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use viz::{Hub, KeyframePose, LiveImage, LivePixels, PendingRender, Server, ServerConfig, Status};
-
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-        },
-        hub.clone(),
-    );
-    (hub, server.expect("a free port exists"))
-}
+use viz::{Hub, KeyframePose, LiveImage, LivePixels, PendingRender, Status};
 
 fn next(hub: &Hub) -> PendingRender {
     assert!(
@@ -196,7 +186,7 @@ fn views_are_independent_and_take_turns() {
 #[test]
 fn keyframes_are_sent_as_changes() {
     let (hub, server) = start();
-    hub.set_keyframes((0..300).map(keyframe).collect());
+    hub.keyframes().set((0..300).map(keyframe).collect());
     let mut client = Client::connect(server.address());
     client.text();
     client.send_json(
@@ -214,7 +204,7 @@ fn keyframes_are_sent_as_changes() {
                 .map(|keyframe| keyframe["stamp_nanos"].as_i64()),
         );
     }
-    hub.set_keyframes((1..302).map(keyframe).collect());
+    hub.keyframes().set((1..302).map(keyframe).collect());
     let changes = client.text_of("keyframe_changes");
     let added: Vec<_> = changes["keyframes"]
         .as_array()
@@ -283,7 +273,7 @@ fn idle_page_receives_less_than_80_kb_per_second() {
     const SECS: u64 = 4;
     let (hub, server) = start();
     hub.set_robot(robot::description());
-    hub.set_keyframes((0..400).map(keyframe).collect());
+    hub.keyframes().set((0..400).map(keyframe).collect());
     let mut client = Client::connect(server.address());
     client.text();
     let capabilities = [
@@ -319,7 +309,8 @@ fn idle_page_receives_less_than_80_kb_per_second() {
                 });
             }
             if ix % 60 == 0 {
-                hub.set_keyframes((0..=400 + ix / 60).map(keyframe).collect());
+                hub.keyframes()
+                    .set((0..=400 + ix / 60).map(keyframe).collect());
                 let psnr_history = (0..512)
                     .map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123))
                     .collect();
@@ -551,7 +542,7 @@ fn decode_compact(header: &Value, bytes: &[u8]) -> Vec<f64> {
 fn nothing_long_is_sent_before_a_hello_on_a_slow_link() {
     const DELAY: Duration = Duration::from_millis(150);
     let (hub, server) = start();
-    hub.set_keyframes((0..40).map(keyframe).collect());
+    hub.keyframes().set((0..40).map(keyframe).collect());
     hub.set_live_image(camera_image(1));
     // Repeated if this computer is so busy that the hello came late.
     for _ in 0..20 {

@@ -4,6 +4,7 @@
 
 mod moved_picture;
 
+use crate::local_server::serve;
 use crate::proxy::{Link, Proxy};
 use crate::request_thread::RequestThread;
 use analytic_scene::{draw, looking_along_y};
@@ -168,7 +169,7 @@ fn publish_updates(hub: &Hub) {
         world_from_camera: turned(0.15 * f64::from(ix)),
         ..live.clone()
     });
-    hub.set_keyframes(keyframes.collect());
+    hub.keyframes().set(keyframes.collect());
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],
         radius_m: 0.8,
@@ -219,13 +220,7 @@ fn page_renders_scene_and_overlays_correctly() {
     };
     let hub = Hub::new();
     publish_updates(&hub);
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let render_thread = RenderThread::start(hub.clone());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-{}", std::process::id()));
@@ -700,13 +695,7 @@ fn page_shows_connection_loss_and_run_result() {
     };
     let hub = Hub::new();
     publish_updates(&hub);
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address(), LINK);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));

@@ -2,15 +2,13 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
+use crate::local_server::serve;
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
-use viz::{
-    Hub, ModelStatus, NewestKeyframe, SceneHint, Server, ServerConfig, ShownPicture, Status,
-    TrainedKeyframes,
-};
+use viz::{Hub, ModelStatus, NewestKeyframe, SceneHint, ShownPicture, Status, TrainedKeyframes};
 
 const WINDOW_PX: [u32; 2] = [640, 400];
 /// Age of a keyframe when it is added to the model.
@@ -102,13 +100,7 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
         radius_m: 0.8,
         world_from_camera,
     });
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
         .join(format!("chromium-latency-{}", std::process::id()));
     let model = Model {

@@ -3,6 +3,7 @@
 //! WebGL calls draw nothing, because drawing on the CPU would dominate the tasks. Skipped, with
 //! a message, if Chromium or the bundle (`make web`) is missing.
 
+use crate::local_server::serve;
 use crate::robot;
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;
@@ -11,9 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::Picture;
-use viz::{
-    Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status,
-};
+use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Status};
 
 const WINDOW_PX: [u32; 2] = [1280, 720];
 const N_KEYFRAMES: i64 = 400;
@@ -61,7 +60,8 @@ fn publish(hub: &Hub, is_over: &AtomicBool) {
             });
         }
         if tick % 60 == 0 {
-            hub.set_keyframes((0..=N_KEYFRAMES + tick / 60).map(keyframe).collect());
+            hub.keyframes()
+                .set((0..=N_KEYFRAMES + tick / 60).map(keyframe).collect());
             let psnr_history = (0..512)
                 .map(|n| (f64::from(n) * 1.37, 20.0 + f64::from(n) * 0.0123))
                 .collect();
@@ -106,13 +106,7 @@ fn tasks_of_the_main_thread_are_short() {
         radius_m: 0.8,
         world_from_camera: analytic_scene::looking_along_y(),
     });
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
         .join(format!("chromium-tasks-{}", std::process::id()));
     let is_over = AtomicBool::new(false);

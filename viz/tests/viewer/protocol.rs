@@ -5,6 +5,7 @@ use crate::client;
 use crate::client::TIMEOUT;
 use crate::client::{Client, Received};
 use crate::keyframe_images::header_of_photograph;
+use crate::local_server::start;
 use crate::robot;
 use analytic_scene::draw;
 use keyframe::RangePoints;
@@ -23,17 +24,6 @@ use viz::{
     ObservedCell, OperatorStatus, PendingRender, RangeScan, RequestedCheckpoint, SceneBounds,
     SceneHint, Server, ServerConfig, Status,
 };
-
-fn start() -> (Hub, Server) {
-    let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-        },
-        hub.clone(),
-    );
-    (hub, server.expect("a free port exists"))
-}
 
 fn render_message(id: u64) -> Value {
     json!({
@@ -80,7 +70,7 @@ fn client_receives_hello_then_current_state() {
         radius_m: 0.5,
         world_from_camera: Translation3::new(1.0, 2.0, 3.0).into(),
     });
-    hub.set_keyframes(vec![KeyframePose {
+    hub.keyframes().set(vec![KeyframePose {
         camera: "wrist".into(),
         stamp: Stamp(0),
         world_from_camera: Transform::identity(),

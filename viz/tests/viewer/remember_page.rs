@@ -46,8 +46,8 @@ fn page_finds_its_view_again() {
         world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
     });
     let keyframes = keyframes();
-    hub.set_keyframe_sources(&keyframes);
-    hub.set_keyframes(keyframes.iter().map(listed).collect());
+    hub.keyframes().set_sources(&keyframes);
+    hub.keyframes().set(keyframes.iter().map(listed).collect());
     let config = ServerConfig {
         listen: ([127, 0, 0, 1], 0).into(),
     };

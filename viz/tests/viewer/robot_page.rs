@@ -3,8 +3,9 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
-use crate::request_thread::RequestThread;
+use crate::local_server::serve;
 use crate::robot;
+use crate::scene_thread::{SceneThread, full_request};
 use analytic_scene::{draw, looking_along_y, ray_in_world};
 use kinematics::Chain;
 use nalgebra::{Point3, Translation3, Vector3};
@@ -15,7 +16,7 @@ use std::time::Duration;
 use test_support::browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use test_support::silhouette::iou;
 use trainer::{Projection, RenderRequest};
-use viz::{Hub, RobotState, RunResult, SceneHint, Server, ServerConfig};
+use viz::{Hub, RobotState, RunResult, SceneHint};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Required overlap of the drawn silhouette with the exact one: intersection over union.
@@ -25,29 +26,15 @@ const MIN_IOU: f64 = 0.97;
 struct Run {
     angle: Arc<Mutex<f64>>,
     base_x: Arc<Mutex<f64>>,
-    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    pictures: SceneThread,
     stop: Arc<AtomicBool>,
-    _renderer: RequestThread,
     arm: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Run {
     fn start(hub: &Hub) -> Self {
         let angle: Arc<Mutex<f64>> = Arc::default();
-        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let received = Arc::clone(&requests);
-        let renderer = RequestThread::start(hub.clone(), move |pending| {
-            // Panoramas are requested for the surroundings of the view.
-            if pending.request.projection != Projection::Equirectangular {
-                received
-                    .lock()
-                    .expect("no panic")
-                    .push(pending.request.clone());
-            }
-            let picture = draw(&pending.request);
-            pending.deliver(picture);
-        });
         let base_x: Arc<Mutex<f64>> = Arc::default();
         let arm = {
             let (hub, stop) = (hub.clone(), Arc::clone(&stop));
@@ -65,9 +52,8 @@ impl Run {
         Self {
             angle,
             base_x,
-            requests,
+            pictures: SceneThread::start(hub.clone()),
             stop,
-            _renderer: renderer,
             arm: Some(arm),
         }
     }
@@ -79,10 +65,6 @@ impl Run {
 
     fn rotate_to(&self, angle: f64) {
         *self.angle.lock().expect("no panic") = angle;
-    }
-
-    fn last_request(&self) -> Option<RenderRequest> {
-        self.requests.lock().expect("no panic").last().cloned()
     }
 }
 
@@ -141,13 +123,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         world_from_camera: Translation3::new(0.0, 0.0, 0.3) * looking_along_y(),
     });
     hub.set_robot(robot::description());
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let run = Run::start(&hub);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-robot-{}", std::process::id()));
@@ -155,7 +131,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     wait_for(&mut browser, "a picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
-    let request = full_request(&mut browser, &run, "a full picture", |_| true);
+    let request = full_request(&mut browser, &run.pictures, "a full picture", |_| true);
     browser.click("toggle-grid");
 
     let mut masks = Vec::new();
@@ -220,27 +196,9 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// Waits for a picture in full resolution that has this property, and returns its request.
-fn full_request(
-    browser: &mut Browser,
-    run: &Run,
-    what: &str,
-    is_expected: impl Fn(&RenderRequest) -> bool,
-) -> RenderRequest {
-    let mut full = None;
-    wait_for(browser, what, |browser| {
-        let [.., width, height] = canvas_bounds(browser);
-        full = run
-            .last_request()
-            .filter(|request| request.size_px == [width, height] && is_expected(request));
-        full.is_some()
-    });
-    full.expect("the wait has ended")
-}
-
 /// A double click rotates the view toward the surface at that pixel.
 fn check_pivot(browser: &mut Browser, run: &Run) {
-    let before = full_request(browser, run, "a full picture", |_| true);
+    let before = full_request(browser, &run.pictures, "a full picture", |_| true);
     let [x, y] = [before.size_px[0] / 2 - 150, before.size_px[1] / 2 + 250];
     let ix = (y * before.size_px[0] + x) as usize;
     let depth = f64::from(draw(&before).depth_m[ix]);
@@ -254,7 +212,7 @@ fn check_pivot(browser: &mut Browser, run: &Run) {
         top + y
     ));
     wait_for(browser, "a view toward the surface", |_| {
-        run.last_request().is_some_and(|request| {
+        run.pictures.last_request().is_some_and(|request| {
             let in_camera = request.world_from_camera.inverse_transform_point(&surface);
             in_camera.z > 0.0 && in_camera.coords.xy().norm() < 0.02 * in_camera.z
         })
@@ -268,7 +226,7 @@ fn check_views(browser: &mut Browser, run: &Run) {
     let front = -(base.rotation * Vector3::x());
     for (button, forward) in [("look-top", -Vector3::z()), ("look-front", front)] {
         browser.click(button);
-        full_request(browser, run, button, |request| {
+        full_request(browser, &run.pictures, button, |request| {
             (request.world_from_camera.rotation * Vector3::z() - forward).norm() < 0.01
         });
     }
@@ -278,7 +236,7 @@ fn check_views(browser: &mut Browser, run: &Run) {
     browser.mouse("mousePressed", [x, y]);
     (1..=3).for_each(|step| browser.mouse("mouseMoved", [x, y - 10 * step]));
     browser.mouse("mouseReleased", [x, y - 30]);
-    full_request(browser, run, "a lower view along y", |request| {
+    full_request(browser, &run.pictures, "a lower view along y", |request| {
         let forward = request.world_from_camera.rotation * Vector3::z();
         forward.z > 0.1 && forward.x.abs() < 1e-6
     });
@@ -289,7 +247,7 @@ fn check_frames(browser: &mut Browser, run: &Run) {
     /// Colors of the x, y and z axes.
     const COLORS: [[u8; 3]; 3] = [[0xf0, 0x71, 0x6a], [0x7b, 0xd8, 0x8f], [0x6c, 0xb6, 0xff]];
     const MAX_DIFFERENCE: u8 = 60;
-    let request = full_request(browser, run, "a full picture", |_| true);
+    let request = full_request(browser, &run.pictures, "a full picture", |_| true);
     let state = robot::state(0.9);
     let chain = Chain::from_urdf(robot::URDF, "pedestal", "tip").expect("a chain");
     let world_from_tip = state.world_from_base * chain.forward(&[0.9, 0.2]).expect("a pose");
@@ -373,11 +331,11 @@ fn check_titles(browser: &mut Browser) {
 /// The crop box encloses the scene; dragging a handle moves one side and not the view.
 fn check_crop(browser: &mut Browser, run: &Run) {
     assert_eq!(
-        full_request(browser, run, "a full picture", |_| true).crop,
+        full_request(browser, &run.pictures, "a full picture", |_| true).crop,
         None
     );
     browser.click("toggle-crop");
-    let before = full_request(browser, run, "a cropped picture", |request| {
+    let before = full_request(browser, &run.pictures, "a cropped picture", |request| {
         request.crop.is_some()
     });
     let crop = before.crop.expect("a crop");
@@ -412,7 +370,7 @@ fn check_crop(browser: &mut Browser, run: &Run) {
                 .inverse_transform_point(&handle_m)
                 .z
             / focal_px[0];
-    let after = full_request(browser, run, "a smaller box", |request| {
+    let after = full_request(browser, &run.pictures, "a smaller box", |request| {
         request
             .crop
             .is_some_and(|crop| (crop.max_m[0] - expected_x).abs() < 0.02)
@@ -427,7 +385,7 @@ fn check_crop(browser: &mut Browser, run: &Run) {
         "the view has not moved"
     );
     browser.click("toggle-crop");
-    full_request(browser, run, "the whole scene", |request| {
+    full_request(browser, &run.pictures, "the whole scene", |request| {
         request.crop.is_none()
     });
 }
@@ -435,19 +393,29 @@ fn check_crop(browser: &mut Browser, run: &Run) {
 /// The view follows the base, but not the arm.
 fn check_follow(browser: &mut Browser, run: &Run) {
     let eye = |request: &RenderRequest| request.world_from_camera.translation.vector;
-    let before = eye(&full_request(browser, run, "a full picture", |_| true));
+    let before = eye(&full_request(
+        browser,
+        &run.pictures,
+        "a full picture",
+        |_| true,
+    ));
     browser.click("toggle-follow");
     // The view keeps its pose relative to the frame as it is in the next frame.
     browser.next_frame();
     browser.next_frame();
     run.rotate_to(0.2);
     std::thread::sleep(Duration::from_millis(300));
-    let resting = eye(&full_request(browser, run, "a full picture", |_| true));
+    let resting = eye(&full_request(
+        browser,
+        &run.pictures,
+        "a full picture",
+        |_| true,
+    ));
     assert!((resting - before).norm() < 1e-6, "the arm moves alone");
     run.move_base(0.25);
     full_request(
         browser,
-        run,
+        &run.pictures,
         "a view that has moved with the base",
         |request| (eye(request) - before - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-3,
     );

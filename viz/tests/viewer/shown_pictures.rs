@@ -2,9 +2,10 @@
 
 use crate::client::Client;
 use crate::client::TIMEOUT;
+use crate::local_server::serve;
 use serde_json::{Value, json};
 use std::time::{Duration, Instant};
-use viz::{Hub, NewestKeyframe, Server, ServerConfig, TrainedKeyframes};
+use viz::{Hub, NewestKeyframe, TrainedKeyframes};
 
 /// Age of a keyframe when it is drawn, and time since it was added to the model.
 const AGE: Duration = Duration::from_millis(300);
@@ -49,13 +50,7 @@ fn trained_on(n: u64) -> Option<TrainedKeyframes> {
 #[test]
 fn pictures_have_the_times_of_their_newest_keyframe() {
     let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let mut client = Client::connect(server.address());
     let before_millis = client.text_of("hello")["clock_millis"]
         .as_f64()
@@ -106,13 +101,7 @@ fn pictures_have_the_times_of_their_newest_keyframe() {
 #[test]
 fn shown_pictures_reach_the_run() {
     let hub = Hub::new();
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let mut client = Client::connect(server.address());
     let capabilities = client.text_of("hello")["capabilities"].clone();
     assert!(

@@ -2,6 +2,7 @@
 //!
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
+use crate::local_server::serve;
 use crate::request_thread::RequestThread;
 use analytic_scene::{draw, looking_along_y};
 use nalgebra::Vector3;
@@ -10,7 +11,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::RenderRequest;
-use viz::{Hub, SceneHint, Server, ServerConfig};
+use viz::{Hub, SceneHint};
 
 const WINDOW_PX: [u32; 2] = [900, 500];
 /// Two views, two seconds, 30 pictures per second.
@@ -103,13 +104,7 @@ fn a_recorded_video_has_every_frame() {
         radius_m: 0.8,
         world_from_camera: looking_along_y(),
     });
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let renderer = Renderer::start(hub);
     let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
         .join(format!("chromium-video-{}", std::process::id()));

@@ -4,9 +4,10 @@
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 use crate::eye_page::{self, clearance};
-use crate::request_thread::RequestThread;
+use crate::local_server::serve;
 use crate::robot;
-use analytic_scene::{draw, looking_along_y};
+use crate::scene_thread::{SceneThread, full_request};
+use analytic_scene::looking_along_y;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;
@@ -16,10 +17,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, browser_for_page, canvas_bounds, canvas_shot, wait_for};
 use trainer::{Projection, RenderRequest};
-use viz::{
-    Hub, LiveImage, LivePixels, ModelStatus, RobotState, SceneBounds, SceneHint, Server,
-    ServerConfig, Status,
-};
+use viz::{Hub, LiveImage, LivePixels, ModelStatus, RobotState, SceneBounds, SceneHint, Status};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Heading of the robot at the start, see [`robot::state`].
@@ -51,25 +49,13 @@ impl RobotPose {
 /// Draws pictures and moves the robot on separate threads, like a run.
 struct Run {
     pose: Arc<Mutex<RobotPose>>,
-    requests: Arc<Mutex<Vec<RenderRequest>>>,
+    pictures: SceneThread,
     stop: Arc<AtomicBool>,
-    _renderer: RequestThread,
     robot: Option<std::thread::JoinHandle<()>>,
 }
 
 impl Run {
     fn start(hub: &Hub) -> Self {
-        let requests: Arc<Mutex<Vec<RenderRequest>>> = Arc::default();
-        let received = Arc::clone(&requests);
-        let renderer = RequestThread::start(hub.clone(), move |pending| {
-            // Panoramas are requested for the surroundings of the view.
-            if pending.request.projection != Projection::Equirectangular {
-                let request = pending.request.clone();
-                received.lock().expect("no panic").push(request);
-            }
-            let picture = draw(&pending.request);
-            pending.deliver(picture);
-        });
         let pose = Arc::new(Mutex::new(RobotPose {
             moved: Transform::identity(),
             arm_rad: 0.3,
@@ -87,9 +73,8 @@ impl Run {
         };
         Self {
             pose,
-            requests,
+            pictures: SceneThread::start(hub.clone()),
             stop,
-            _renderer: renderer,
             robot: Some(robot),
         }
     }
@@ -100,10 +85,6 @@ impl Run {
 
     fn set_pose(&self, pose: RobotPose) {
         *self.pose.lock().expect("no panic") = pose;
-    }
-
-    fn last_request(&self) -> Option<RenderRequest> {
-        self.requests.lock().expect("no panic").last().cloned()
     }
 }
 
@@ -190,29 +171,11 @@ fn shows_all(request: &RenderRequest, bounds: &SceneBounds, base: &Transform) ->
         .all(|point| shows(request, point))
 }
 
-/// Waits for a picture in full resolution that has this property, and returns its request.
-fn full_request(
-    browser: &mut Browser,
-    run: &Run,
-    what: &str,
-    mut is_expected: impl FnMut(&RenderRequest) -> bool,
-) -> RenderRequest {
-    let mut full = None;
-    wait_for(browser, what, |browser| {
-        let [.., width, height] = canvas_bounds(browser);
-        full = run
-            .last_request()
-            .filter(|request| request.size_px == [width, height] && is_expected(request));
-        full.is_some()
-    });
-    full.expect("the wait has ended")
-}
-
 /// Waits until the view is at rest and shown in full, and returns its request.
 fn settled(browser: &mut Browser, run: &Run) -> RenderRequest {
     browser.next_frame();
     let mut before = None;
-    full_request(browser, run, "a view at rest", |request| {
+    full_request(browser, &run.pictures, "a view at rest", |request| {
         let pose = Some(request.world_from_camera);
         let is_same = std::mem::replace(&mut before, pose) == pose;
         std::thread::sleep(REST);
@@ -270,13 +233,7 @@ fn views_follow_the_scene_and_the_robot() {
     let hub = Hub::new();
     set_scene(&hub, cube(0.4));
     hub.set_robot(robot::description());
-    let server = Server::start(
-        ServerConfig {
-            listen: ([127, 0, 0, 1], 0).into(),
-        },
-        hub.clone(),
-    )
-    .expect("a free port");
+    let server = serve(&hub);
     let run = Run::start(&hub);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-views-{}", std::process::id()));
@@ -303,13 +260,16 @@ fn check_first_view(browser: &mut Browser, run: &Run, hub: &Hub) {
             && forward.z < -0.3
             && shows_all(request, bounds, &run.pose().base())
     };
-    let first = full_request(browser, run, "an overview", |request| {
+    let first = full_request(browser, &run.pictures, "an overview", |request| {
         is_overview(request, &cube(0.4))
     });
     set_scene(hub, cube(1.2));
-    let grown = full_request(browser, run, "an overview of the grown scene", |request| {
-        is_overview(request, &cube(1.2))
-    });
+    let grown = full_request(
+        browser,
+        &run.pictures,
+        "an overview of the grown scene",
+        |request| is_overview(request, &cube(1.2)),
+    );
     assert!(
         (eye(&grown) - eye(&first)).norm() > 1.0,
         "it is farther away"
@@ -319,17 +279,26 @@ fn check_first_view(browser: &mut Browser, run: &Run, hub: &Hub) {
         moved: Transform::translation(3.0, 0.0, 0.0),
         ..run.pose()
     });
-    full_request(browser, run, "an overview with the robot", |request| {
-        is_overview(request, &cube(1.2))
-    });
+    full_request(
+        browser,
+        &run.pictures,
+        "an overview with the robot",
+        |request| is_overview(request, &cube(1.2)),
+    );
     let there = run.pose();
     run.set_pose(RobotPose {
         moved: Transform::identity(),
         ..there
     });
-    full_request(browser, run, "an overview with the path", |request| {
-        is_overview(request, &cube(1.2)) && shows(request, &there.base().translation.vector.into())
-    });
+    full_request(
+        browser,
+        &run.pictures,
+        "an overview with the path",
+        |request| {
+            is_overview(request, &cube(1.2))
+                && shows(request, &there.base().translation.vector.into())
+        },
+    );
 
     drag(browser);
     let dragged = settled(browser, run);
@@ -346,10 +315,11 @@ fn check_first_view(browser: &mut Browser, run: &Run, hub: &Hub) {
             },
             ..Status::default()
         });
-        run.last_request()
+        run.pictures
+            .last_request()
             .is_some_and(|request| (request.far_m - far_m(&larger)).abs() < 1e-6)
     });
-    let after = run.last_request().expect("a request");
+    let after = run.pictures.last_request().expect("a request");
     let motion = dragged.world_from_camera.inverse() * after.world_from_camera;
     assert!(
         motion.translation.vector.norm() < 1e-6 && motion.rotation.angle() < 1e-6,
@@ -358,11 +328,12 @@ fn check_first_view(browser: &mut Browser, run: &Run, hub: &Hub) {
     // The zoom would have ended at a distance of 8 m in the first scene, and ends at 37 m in this one.
     wait_for(browser, "a view from far away", |browser| {
         roll(browser);
-        run.last_request()
+        run.pictures
+            .last_request()
             .is_some_and(|request| eye(&request).coords.norm() > 15.0)
     });
     press(browser, "0", "Digit0");
-    full_request(browser, run, "an overview of all", |request| {
+    full_request(browser, &run.pictures, "an overview of all", |request| {
         is_overview(request, &larger)
     });
 }
@@ -372,7 +343,7 @@ fn check_axes(browser: &mut Browser, run: &Run) {
     let front = -Vector3::new(HEADING_RAD.cos(), HEADING_RAD.sin(), 0.0);
     for (button, expected) in [("look-top", -Vector3::z()), ("look-front", front)] {
         browser.click(button);
-        full_request(browser, run, button, |request| {
+        full_request(browser, &run.pictures, button, |request| {
             (forward(request) - expected).norm() < 0.01
                 && shows_all(request, &cube(1.8), &run.pose().base())
         });
@@ -394,7 +365,7 @@ fn check_chase(browser: &mut Browser, run: &Run) {
         arm_rad: 0.8,
     });
     std::thread::sleep(Duration::from_millis(600));
-    let resting = run.last_request().expect("a request");
+    let resting = run.pictures.last_request().expect("a request");
     assert!(
         (eye(&resting) - eye(&before)).norm() < 1e-6,
         "pictures can become sharp"
@@ -409,7 +380,7 @@ fn check_chase(browser: &mut Browser, run: &Run) {
     let expected = motion * before.world_from_camera;
     full_request(
         browser,
-        run,
+        &run.pictures,
         "a view that has turned with the base",
         |request| {
             let error = expected.inverse() * request.world_from_camera;
@@ -431,7 +402,7 @@ fn check_chase(browser: &mut Browser, run: &Run) {
     });
     full_request(
         browser,
-        run,
+        &run.pictures,
         "a view that has turned with the tool",
         |request| {
             let angle_rad = forward(request).angle(&forward(&before));
@@ -484,9 +455,12 @@ fn check_rides(browser: &mut Browser, run: &Run, hub: &Hub) {
             && browser.evaluate("document.querySelectorAll('#live figure').length") == 2
     });
     browser.evaluate(&format!("{button}?.click()"));
-    let riding = full_request(browser, run, "the view of the camera", |request| {
-        has_pose(request, &poses[0])
-    });
+    let riding = full_request(
+        browser,
+        &run.pictures,
+        "the view of the camera",
+        |request| has_pose(request, &poses[0]),
+    );
     let Projection::Pinhole { focal_px, .. } = riding.projection else {
         panic!("a pinhole")
     };
@@ -505,27 +479,36 @@ fn check_rides(browser: &mut Browser, run: &Run, hub: &Hub) {
     let image = live_image("front", moved, -Vector3::x(), sideways);
     let pose = image.world_from_camera.expect("a pose");
     hub.set_live_image(image);
-    full_request(browser, run, "the view of the moved camera", |request| {
-        has_pose(request, &pose)
-    });
+    full_request(
+        browser,
+        &run.pictures,
+        "the view of the moved camera",
+        |request| has_pose(request, &pose),
+    );
     assert!(
         !is_shown(browser, "robot-arrow"),
         "the robot is in the picture"
     );
 
     press(browser, "c", "KeyC");
-    full_request(browser, run, "the view of the next camera", |request| {
-        has_pose(request, &poses[1])
-    });
+    full_request(
+        browser,
+        &run.pictures,
+        "the view of the next camera",
+        |request| has_pose(request, &poses[1]),
+    );
     wait_for(browser, "an arrow to the robot", |browser| {
         is_shown(browser, "robot-arrow")
     });
     press(browser, "c", "KeyC");
-    full_request(browser, run, "the first camera again", |request| {
-        has_pose(request, &pose)
-    });
+    full_request(
+        browser,
+        &run.pictures,
+        "the first camera again",
+        |request| has_pose(request, &pose),
+    );
     drag(browser);
-    full_request(browser, run, "an upright view", |request| {
+    full_request(browser, &run.pictures, "an upright view", |request| {
         let right = request.world_from_camera.rotation * Vector3::x();
         right.z.abs() < 1e-6 && !has_pose(request, &pose)
     });
@@ -537,7 +520,7 @@ fn check_rides(browser: &mut Browser, run: &Run, hub: &Hub) {
         is_shown(browser, "robot-arrow")
     });
     browser.click("robot-arrow");
-    full_request(browser, run, "the overview", |request| {
+    full_request(browser, &run.pictures, "the overview", |request| {
         shows_all(request, &cube(1.8), &run.pose().base())
     });
     wait_for(browser, "no arrow", |browser| {
@@ -579,7 +562,7 @@ fn check_near_links(browser: &mut Browser, run: &Run, hub: &Hub) {
             );
         }
         wait_for(browser, "the pedestal as it should look", |browser| {
-            let is_there = run.last_request().is_some_and(|request| {
+            let is_there = run.pictures.last_request().is_some_and(|request| {
                 let error = pose.inverse() * request.world_from_camera;
                 error.translation.vector.norm() < TOLERANCE
             });
