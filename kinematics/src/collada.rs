@@ -319,7 +319,7 @@ fn rotation(values: &[f64]) -> Matrix4<f64> {
     })
 }
 
-/// Adds a convex polygon, or a fan, which is divided at its first corner.
+/// Adds a triangle fan. Convex polygons are fans, too: all triangles share the first corner.
 fn add_fan(corners: &[[f64; 3]], triangles: &mut Vec<Triangle>) {
     let pairs = corners.windows(2).skip(1);
     triangles.extend(pairs.map(|pair| [corners[0], pair[0], pair[1]]));

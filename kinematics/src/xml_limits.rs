@@ -21,7 +21,7 @@ pub(crate) fn check(xml: &str, max_bytes: usize) -> Result<(), String> {
     )
 }
 
-/// An error if a text has more than `max` of something.
+/// Fails if the number `n` of things named `what` exceeds `max`.
 fn limited(what: &str, n: usize, max: usize) -> Result<(), String> {
     if n <= max {
         return Ok(());

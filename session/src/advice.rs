@@ -18,10 +18,11 @@ const PROBLEM_SHARE: f64 = 1.0 / 2.0;
 /// Smaller losses are common on slow computers and are no problem. From this share on, they are
 /// mentioned.
 const MENTIONED_SHARE: f64 = 1.0 / 4.0;
-/// What is shown stays until its share has fallen below this part of the share with which it began.
-/// Otherwise, it would come and go while the share varies around that limit.
+/// A finding is shown until its share of the images is below this part of the share at which it is
+/// first shown. With a single limit, it would appear and disappear while the share varies around
+/// the limit.
 const KEPT_PART: f64 = 2.0 / 3.0;
-/// A shown share is replaced if the share differs by more than this.
+/// The share in a shown text is updated if it has changed by more than this.
 const MIN_SHARE_CHANGE: f64 = 0.15;
 /// Maximum difference between a share and the simple fraction, such as 7 of 8, by which it is
 /// described.

@@ -276,7 +276,7 @@ impl Evaluator {
         }
         let lens = method.calibrated_camera(&keyframe)?;
         let depth = comparable_depth(method, &keyframe);
-        // Depth that is aligned with the image is in the same picture.
+        // If the depth image has the same viewing rays as the color image, one picture gives both.
         let is_aligned = depth
             .as_ref()
             .is_some_and(|depth| is_aligned(depth, &lens, &keyframe));

@@ -110,7 +110,7 @@ impl Robot {
         steered.unwrap_or_else(|| self.motion.world_from_base(nanos as f64 * 1e-9))
     }
 
-    /// Completed fraction of the walk, from which the drift of the reported pose follows.
+    /// Completed fraction of the walk. The reported pose drifts with it.
     pub(crate) fn walked_frac(&self, nanos: i64) -> f64 {
         let steered = self
             .way
@@ -127,7 +127,7 @@ impl Robot {
         }
     }
 
-    /// Whether commands move the arm or the base, which may come at any time.
+    /// Whether a client or an operator commands the arm or the base. Commands may come at any time.
     pub(crate) fn is_commanded(&self) -> bool {
         matches!(&self.arm, Some(ArmMotion::Simulated(arm)) if arm.is_commanded())
             || self.way.as_ref().is_some_and(BaseWay::has_begun)

@@ -25,7 +25,7 @@ impl UrdfFolder {
         }
     }
 
-    /// This folder. The result has no folder if the path is not absolute.
+    /// A robot description in this folder. If the path is relative, the folder counts as unknown.
     #[must_use]
     pub fn at(folder: &Path) -> Self {
         Self {
@@ -34,8 +34,8 @@ impl UrdfFolder {
         }
     }
 
-    /// The same folder, with the mesh files of a recording. Earlier mesh files of a recording are
-    /// kept instead.
+    /// Adds the mesh files of a recording. If there already are mesh files of a recording, these
+    /// files are kept.
     #[must_use]
     pub(crate) fn with_recorded(self, recorded: RecordedMeshes) -> Self {
         Self {

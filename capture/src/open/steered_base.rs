@@ -128,7 +128,7 @@ fn open_real(motion: &BaseMotion, tap: RobotTap) -> anyhow::Result<SteeredBase> 
     let Some(address) = motion.address else {
         bail!("base.motion.address is missing: this is a bug");
     };
-    // Two starts never have the same time.
+    // The session must differ from the sessions of earlier starts, so it is the time of the start.
     let session = clock::now().0.unsigned_abs();
     let base = UdpDrivenBase::open(address, session)?;
     log::info!("base: driving the controller at {address}");

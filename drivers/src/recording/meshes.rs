@@ -47,7 +47,7 @@ pub fn compress_mesh(contents: &[u8]) -> Vec<u8> {
 /// only.
 pub fn decompress_mesh(compressed: &[u8], budget: Budget) -> Result<Vec<u8>> {
     let mut contents = Vec::new();
-    // One byte more shows that the contents are too large.
+    // Reads at most one byte more than is allowed. If this byte exists, the contents are too large.
     let limit = budget.max_bytes.saturating_add(1);
     MultiGzDecoder::new(compressed)
         .take(limit)

@@ -27,7 +27,8 @@ pub struct UdpDrivenBase {
     session: u64,
     seq: u64,
     sent_at: Option<Stamp>,
-    /// Number of the first command of zero since the last other velocity.
+    /// Number of the command with which the latest stop began: the first zero velocity after the
+    /// last other velocity.
     stop_seq: Option<u64>,
     /// The newest reply, and when it arrived.
     reply: Option<(DriveReply, Stamp)>,
@@ -78,8 +79,9 @@ impl UdpDrivenBase {
         reply.refusal.is_none() && self.stop_seq.is_some_and(|stop| reply.seq >= stop)
     }
 
-    /// End of a velocity that is sent now, on the clock of the base. It is early by the time that
-    /// the newest reply took, so that no delay makes a velocity last longer.
+    /// End of a velocity that is sent now, on the clock of the base. The time that the newest reply
+    /// took is ignored, so the end is early by this time. A velocity therefore never lasts longer
+    /// because of a delay.
     fn expires_nanos(&self, now: Stamp) -> Option<i64> {
         let (reply, received_at) = self.reply.as_ref()?;
         let base_now = Stamp(
@@ -142,7 +144,8 @@ impl MovableBase for UdpDrivenBase {
         };
         match self.socket.send(&encode_command(&command)) {
             Ok(_) => Ok(()),
-            // Nobody listens yet, or the queue is full. The silence of the base shows it.
+            // No program listens yet, or the queue is full. This needs no error, because the
+            // missing replies of the base are noticed.
             Err(error)
                 if matches!(
                     error.kind(),

@@ -748,7 +748,7 @@ mod tests {
         let page = include_str!("../../../docs/reference/udp.md");
         let examples: Vec<&str> = page
             .lines()
-            // Those of bases that are driven are tested in `base_drive.rs`.
+            // Datagrams that drive a base have another format, which `base_drive.rs` tests.
             .filter(|line| line.starts_with(r#"{"kind""#) && !line.contains(r#":"drive"#))
             .collect();
         let scans: Vec<ScanPart> = examples

@@ -10,8 +10,9 @@ const N_AROUND: u32 = 12;
 const N_RINGS: u32 = 5;
 
 /// Unit vectors that are distributed over the sphere: both poles of the z axis, and rings between
-/// them. From any direction, the nearest of them is at most half the diagonal of a square with the
-/// side [`DIRECTION_STEP_RAD`] away.
+/// them. Neighbors form cells that are at most as large as squares with the side
+/// [`DIRECTION_STEP_RAD`]. The angle from any direction to the nearest vector is therefore at most
+/// half the diagonal of such a square.
 pub fn directions() -> Vec<Vector3<f64>> {
     let rings = (1..=N_RINGS).map(|ring| f64::from(ring) * DIRECTION_STEP_RAD - FRAC_PI_2);
     let on_rings = rings.flat_map(|elevation_rad| {

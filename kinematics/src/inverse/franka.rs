@@ -38,10 +38,11 @@ pub struct FrankaArm {
     /// away from the axis of joint 6.
     seven_from_tip: Transform,
     lengths: Lengths,
-    /// Lengths of upper arm and forearm. The next field is the value of joint 4 at which the two
-    /// coincide. Both follow from `lengths` and are stored, because each test of the search needs
-    /// them.
+    /// Lengths of upper arm and forearm. They follow from `lengths`, and are stored because each
+    /// test of the search needs them.
     segments_m: [f64; 2],
+    /// Value of joint 4 at which the forearm lies along the upper arm. It is stored for the same
+    /// reason.
     folded_q4: f64,
 }
 
@@ -251,10 +252,11 @@ pub(super) struct Wrist {
     toward_shoulder: Vector3<f64>,
     /// Distance from the shoulder.
     distance_m: f64,
-    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is in the middle
+    /// Value of joint 6 at which the forearm points most toward the shoulder. It is in the middle
     /// between the two solutions.
     middle_q6: f64,
-    /// Cosine of the angle between the two at this value.
+    /// Cosine of the angle between the forearm and the direction toward the shoulder, if joint 6 is
+    /// at `middle_q6`.
     largest_cosine: f64,
     /// Angle between upper arm and forearm.
     elbow_angle: f64,

@@ -28,8 +28,8 @@ use wording::{dropped_images, duration, is_omitted, label, value_text};
 
 /// Name of the page in the folder of a run.
 pub(crate) const FILE: &str = "report.html";
-/// Tables with more rows than this are collapsed. The schedule of evaluations has this many times
-/// in about two hours of training.
+/// Tables with more rows than this are collapsed. A run has this many scheduled evaluations after
+/// about two hours of training.
 const MAX_OPEN_ROWS: usize = 16;
 
 /// The content of the page.

@@ -187,8 +187,9 @@ impl Replay {
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 // Starts training on the keyframes so far without a step.
                 Decision::Begin(_) => drop(step(session, 0)?),
-                // Restored keyframes are in the model of the checkpoint. A replay takes its own
-                // checkpoints.
+                // Restored keyframes need no push, because the model of the checkpoint has them
+                // already. Checkpoints are written at the times of this run, not at those of the
+                // log.
                 Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }
         }

@@ -199,8 +199,8 @@ impl Server {
         format!("{}://{}/", self.scheme, self.address)
     }
 
-    /// Blocks a thread of the server for a time, as a slow operation would. Benches measure with
-    /// it whether other threads wait.
+    /// Blocks a thread of the server for a time, as a slow operation would. A bench calls this
+    /// function to measure whether the other threads continue.
     pub fn block(&self, thread: ServerThread, time: Duration) {
         let runtime = match thread {
             ServerThread::Pages => &self.runtime,
@@ -330,8 +330,8 @@ async fn accept(
                 }
                 let stream = GuardedStream::new(stream, Arc::clone(admission));
                 tokio::spawn(serve_connection(stream, tls.cloned(), app.clone()));
-                // Lets the task of a connection that was replaced release its descriptor before the
-                // next accept.
+                // A new connection may have replaced an older one. The task of the older one now
+                // gets the chance to close its socket, before the next accept needs a descriptor.
                 tokio::task::yield_now().await;
             }
             // The peer has already disconnected.
@@ -397,7 +397,7 @@ where
     let served = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEADER_TIMEOUT)
-        // The buffer may grow beyond its maximum by a part of a read.
+        // The last read may exceed the maximum, so the buffer can become slightly larger.
         .max_header_size(MAX_HEADER_BYTES)
         .max_buf_size(MAX_HEADER_BYTES)
         .serve_connection(TokioIo::new(stream), service)
@@ -513,7 +513,8 @@ async fn file(Path(name): Path<String>, State(app_state): State<AppState>) -> Re
     app_state.files.respond(&name).await
 }
 
-/// A checksum that only this program needs to reproduce.
+/// A checksum of a file. It may differ between versions of this program, because clients only
+/// compare it with an earlier checksum from the same server.
 fn etag(bytes: &[u8]) -> String {
     let mut hasher = DefaultHasher::new();
     bytes.hash(&mut hasher);
