@@ -11,18 +11,17 @@
 //! text, so they are escaped.
 
 use anyhow::Context;
-use background::output_thread::{self, OutputChunk};
+use background::output_thread::OutputQueue;
 use console::Term;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
+use messages::printable;
 use parking_lot::Mutex;
 use serde::Serialize;
 use session::run_log;
-use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::Write;
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Writing to stdout failed.
@@ -47,8 +46,8 @@ const MAX_FLUSH: Duration = Duration::from_secs(5);
 const MAX_ORDERING: Duration = Duration::from_millis(200);
 
 /// Queue of the thread that writes to stdout.
-static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
-    writer(|bytes| {
+static STDOUT: LazyLock<Option<OutputQueue>> = LazyLock::new(|| {
+    start_stream(|bytes| {
         let mut stdout = std::io::stdout().lock();
         if let Err(error) = stdout.write_all(bytes).and_then(|()| stdout.flush()) {
             log_lost(&error.to_string());
@@ -56,51 +55,24 @@ static STDOUT: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
     })
 });
 /// Queue of the thread that writes to stderr.
-static STDERR: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
+static STDERR: LazyLock<Option<OutputQueue>> = LazyLock::new(|| {
     // The output is lost if the terminal is closed or the disk is full.
-    writer(|bytes| drop(std::io::stderr().write_all(bytes)))
+    start_stream(|bytes| drop(std::io::stderr().write_all(bytes)))
 });
 
-/// Starts the thread that calls `write` for each chunk. If it cannot be started, the output is
-/// lost.
-fn writer(write: fn(&[u8])) -> SyncSender<OutputChunk> {
-    let (sender, chunks) = sync_channel(MAX_WAITING);
-    if output_thread::start(chunks, write).is_err() {
+/// Starts the thread of a stream. If it cannot be started, the output is lost.
+fn start_stream(write: fn(&[u8])) -> Option<OutputQueue> {
+    let queue = OutputQueue::start(MAX_WAITING, write).ok();
+    if queue.is_none() {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
-    sender
+    queue
 }
 
 /// Queues text for a stream, and returns false if the queue is full. The progress bars are hidden
 /// during this call.
-fn send(stream: &SyncSender<OutputChunk>, text: String) -> bool {
-    BARS.suspend(|| {
-        stream
-            .try_send(OutputChunk::Bytes(text.into_bytes()))
-            .is_ok()
-    })
-}
-
-/// Escapes control characters other than line breaks and tabs, and characters that change the
-/// direction of text.
-fn printable(text: &str) -> Cow<'_, str> {
-    let is_hidden = |c: char| {
-        (c.is_control() && !matches!(c, '\n' | '\t'))
-            || matches!(c, '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
-    };
-    // Almost all texts need no escapes, and are not copied.
-    if !text.contains(is_hidden) {
-        return text.into();
-    }
-    let mut escaped = String::with_capacity(text.len() + 16);
-    for c in text.chars() {
-        if is_hidden(c) {
-            escaped.extend(c.escape_unicode())
-        } else {
-            escaped.push(c)
-        }
-    }
-    escaped.into()
+fn send(stream: &Option<OutputQueue>, text: String) -> bool {
+    BARS.suspend(|| (stream.as_ref()).is_some_and(|queue| queue.push(text.into_bytes())))
 }
 
 fn log_lost(reason: &str) {
@@ -125,18 +97,13 @@ fn flush_for(max_stdout: Duration, max_stderr: Duration) {
     let began = Instant::now();
     // Both streams get the request before either is waited for, so that they are written in
     // parallel.
-    let [out, err] = [&STDOUT, &STDERR].map(|stream| {
-        let (done, is_done) = sync_channel(1);
-        stream
-            .try_send(OutputChunk::Flush(done))
-            .ok()
-            .map(|()| is_done)
-    });
-    if out.is_none_or(|is_done| is_done.recv_timeout(max_stdout).is_err()) {
+    let [out, err] =
+        [&STDOUT, &STDERR].map(|stream| stream.as_ref().and_then(OutputQueue::request_flush));
+    if !out.is_some_and(|flush| flush.wait(max_stdout)) {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
-    if let Some(is_done) = err {
-        let _ = is_done.recv_timeout(max_stderr.saturating_sub(began.elapsed())); // After a timeout, stderr accepts no output.
+    if let Some(flush) = err {
+        let _ = flush.wait(max_stderr.saturating_sub(began.elapsed())); // After a timeout, stderr accepts no output.
     }
 }
 
@@ -220,7 +187,8 @@ impl TermLike for BarTerm {
     fn flush(&self) -> std::io::Result<()> {
         let buffered = std::mem::take(&mut *self.buffered.lock());
         if !buffered.is_empty() {
-            let _ = STDERR.try_send(OutputChunk::Bytes(buffered.into_bytes())); // A lost bar is drawn again later.
+            // The bars are not hidden for their own output. A lost bar is drawn again later.
+            let _ = (STDERR.as_ref()).is_some_and(|queue| queue.push(buffered.into_bytes()));
         }
         Ok(())
     }
@@ -375,49 +343,5 @@ impl Write for LogTarget {
 
     fn flush(&mut self) -> std::io::Result<()> {
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn control_characters_are_escaped() {
-        for plain in ["a\tb\nc", "Größe 5 µm → 3 Ω", ""] {
-            assert!(matches!(printable(plain), Cow::Borrowed(_)), "{plain}");
-        }
-        assert_eq!(
-            printable("\x1b]0;title\x07\x1b[2J"),
-            "\\u{1b}]0;title\\u{7}\\u{1b}[2J"
-        );
-        assert_eq!(
-            printable("\u{9b}31m\u{7f}\r\u{202e}x"),
-            "\\u{9b}31m\\u{7f}\\u{d}\\u{202e}x"
-        );
-    }
-
-    #[test]
-    fn blocked_stream_blocks_neither_the_program_nor_the_other_stream() {
-        static WRITTEN: Mutex<Vec<u8>> = Mutex::new(Vec::new());
-        let blocked = writer(|_| {
-            loop {
-                std::thread::park();
-            }
-        });
-        let other = writer(|bytes| WRITTEN.lock().extend_from_slice(bytes));
-        let n_queued = (0..2 * MAX_WAITING)
-            .filter(|_| send(&blocked, "log".to_owned()))
-            .count();
-        // The thread may hold one more chunk than the queue.
-        assert!(
-            (MAX_WAITING..=MAX_WAITING + 1).contains(&n_queued),
-            "{n_queued}"
-        );
-        assert!(send(&other, "result".to_owned()));
-        let (done, is_done) = sync_channel(1);
-        assert!(other.try_send(OutputChunk::Flush(done)).is_ok());
-        is_done.recv_timeout(MAX_FLUSH).expect("it is not blocked");
-        assert_eq!(*WRITTEN.lock(), b"result");
     }
 }

@@ -6,13 +6,12 @@
 //! it, with one warning.
 
 use crate::run_folder::{LOG, OLDER_LOG};
-use background::output_thread::{self, OutputChunk};
+use background::output_thread::OutputQueue;
 use parking_lot::Mutex;
 use std::fs::File;
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::Duration;
 
 /// Above this size, the file is renamed and a new one is started. Only one older file is kept, so
@@ -31,7 +30,9 @@ enum Sink {
     /// Into memory, until the folder of the run is known.
     Early(String),
     /// To the thread that writes the file.
-    Thread(SyncSender<OutputChunk>),
+    Thread(OutputQueue),
+    /// Nowhere, because the thread cannot be started.
+    Nowhere,
 }
 
 static SINK: Mutex<Sink> = Mutex::new(Sink::Early(String::new()));
@@ -45,7 +46,10 @@ pub fn record(text: &str) {
             }
         }
         // A record is dropped if the disk blocks. It was also printed to stderr.
-        Sink::Thread(thread) => drop(thread.try_send(OutputChunk::Bytes(text.as_bytes().to_vec()))),
+        Sink::Thread(queue) => {
+            queue.push(text.as_bytes().to_vec());
+        }
+        Sink::Nowhere => {}
     }
 }
 
@@ -54,35 +58,36 @@ pub fn record(text: &str) {
 pub fn begin(folder: &Path, header: &str) {
     let mut sink = SINK.lock();
     let Sink::Early(early) = &*sink else { return };
-    let (thread, chunks) = sync_channel(MAX_WAITING);
     let mut file = LogFile::new(folder);
     // The file is made here and not by the thread, because a run that fails removes its folder, and
     // a file that appears meanwhile would keep it. Errors are described at the first record.
     file.open = OpenFile::in_folder(folder).ok();
     // The header has its own line, and follows the records of an earlier part of the run.
     let start = format!("{header}\n{early}");
-    let started = output_thread::start(chunks, move |bytes| {
+    let queue = OutputQueue::start(MAX_WAITING, move |bytes| {
         if let Some(problem) = file.write_or_describe(bytes) {
             log::warn!("{problem}; the run continues, and the log on stderr is complete");
         }
     });
     // Without a thread, there is no file. The early records are dropped, too.
-    if started.is_ok() {
-        let _ = thread.try_send(OutputChunk::Bytes(start.into_bytes())); // The queue is empty.
-    }
-    *sink = Sink::Thread(thread);
+    *sink = match queue {
+        Ok(queue) => {
+            queue.push(start.into_bytes());
+            Sink::Thread(queue)
+        }
+        Err(_) => Sink::Nowhere,
+    };
 }
 
 /// Waits until the records are written, for a limited time.
 pub fn flush() {
-    let (done, is_done) = sync_channel(1);
     // The lock is released before waiting, because the thread may log a warning.
-    let is_requested = match &*SINK.lock() {
-        Sink::Early(_) => false,
-        Sink::Thread(thread) => thread.try_send(OutputChunk::Flush(done)).is_ok(),
+    let requested = match &*SINK.lock() {
+        Sink::Early(_) | Sink::Nowhere => None,
+        Sink::Thread(queue) => queue.request_flush(),
     };
-    if is_requested {
-        let _ = is_done.recv_timeout(MAX_FLUSH); // After a timeout, the disk accepts no output.
+    if let Some(flush) = requested {
+        let _ = flush.wait(MAX_FLUSH); // After a timeout, the disk accepts no output.
     }
 }
 

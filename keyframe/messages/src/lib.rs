@@ -1,5 +1,5 @@
 //! Parts of messages that all crates share: classes of errors, counts and lists, names of settings,
-//! and words of commands.
+//! words of commands, and escapes for terminals.
 //!
 //! ```
 //! use messages::{BadInput, ErrorClass, counted, listed};
@@ -12,12 +12,14 @@
 
 mod counted;
 mod error_class;
+mod printable;
 mod setting;
 mod shell;
 mod shortened;
 
 pub use counted::{counted, listed};
 pub use error_class::{BadInput, ErrorClass, InsufficientData};
+pub use printable::printable;
 pub use setting::Setting;
 pub use shell::{EXAMPLE_TARGET, quoted_for_shell};
 pub use shortened::shortened;
