@@ -66,6 +66,41 @@ pub enum LensModel {
     KannalaBrandt,
 }
 
+impl LensModel {
+    /// All models.
+    pub const ALL: [Self; 5] = [
+        Self::Auto,
+        Self::Pinhole,
+        Self::BrownConrady5,
+        Self::BrownConrady8,
+        Self::KannalaBrandt,
+    ];
+
+    /// Its name in options.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Pinhole => "pinhole",
+            Self::BrownConrady5 => "brown-conrady",
+            Self::BrownConrady8 => "rational-brown-conrady",
+            Self::KannalaBrandt => "kannala-brandt",
+        }
+    }
+
+    /// Its coefficients.
+    #[must_use]
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::Auto => "The simplest model that explains the images",
+            Self::Pinhole => "No distortion",
+            Self::BrownConrady5 => "k1, k2, p1, p2, k3",
+            Self::BrownConrady8 => "k1, k2, p1, p2, k3, k4, k5, k6",
+            Self::KannalaBrandt => "k1 to k4 of OpenCV's fisheye model",
+        }
+    }
+}
+
 /// Estimates the intrinsics of a camera from images of a flat target, with their uncertainty.
 ///
 /// Images may show parts of the target. Images and corners that are inconsistent with the others

@@ -4,6 +4,7 @@ use super::flags::{ReportFlag, RigFlags};
 use super::target_argument;
 use super::terminal::Terminal;
 use crate::exit::Exit;
+use crate::named_args::one_of;
 use crate::print;
 use calibrate::IntrinsicsTask;
 use calibration::LensModel;
@@ -34,8 +35,9 @@ pub(crate) struct Args {
     #[arg(long, value_name = "SPEC", value_parser = target_argument, help = TARGET_HELP)]
     target: TargetSpec,
     /// Lens model
-    #[arg(long, value_name = "MODEL", value_enum, default_value_t = ModelArg::Auto)]
-    model: ModelArg,
+    #[arg(long, value_name = "MODEL", default_value = LensModel::Auto.name(),
+        value_parser = one_of(LensModel::ALL.map(|model| (model, model.name(), model.description()))))]
+    model: LensModel,
     #[command(flatten)]
     rig: RigFlags,
     /// With a rig file: save the photographs in this folder (PNG), which must be new or empty.
@@ -49,30 +51,12 @@ pub(crate) struct Args {
     json: bool,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum ModelArg {
-    /// The simplest model that explains the images
-    Auto,
-    /// No distortion
-    Pinhole,
-    /// k1, k2, p1, p2, k3
-    BrownConrady,
-    /// k1, k2, p1, p2, k3, k4, k5, k6
-    RationalBrownConrady,
-    /// k1 to k4 of OpenCV's fisheye model
-    KannalaBrandt,
-}
-
 /// Detects the target, calibrates, and prints the result.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let host = Terminal::new(Some(&args.rig.page), args.json);
     let outcome = args.task()?.run(&host)?;
     let document = outcome.document();
-    if args.json {
-        print::json(&document)?
-    } else {
-        print::lines(document.lines())?
-    }
+    print::json_or_lines(args.json, &document, document.lines())?;
     for warning in outcome.warnings() {
         log::warn!("{warning}");
     }
@@ -85,22 +69,10 @@ impl Args {
         Ok(IntrinsicsTask {
             input: self.input.clone(),
             target: self.target.clone(),
-            model: self.model.into(),
+            model: self.model,
             rig: self.rig.options()?,
             report: self.report.options(),
             save_images: self.save_images.clone(),
         })
-    }
-}
-
-impl From<ModelArg> for LensModel {
-    fn from(model: ModelArg) -> Self {
-        match model {
-            ModelArg::Auto => Self::Auto,
-            ModelArg::Pinhole => Self::Pinhole,
-            ModelArg::BrownConrady => Self::BrownConrady5,
-            ModelArg::RationalBrownConrady => Self::BrownConrady8,
-            ModelArg::KannalaBrandt => Self::KannalaBrandt,
-        }
     }
 }
