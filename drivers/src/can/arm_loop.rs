@@ -20,7 +20,7 @@ use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
 use crate::motion::{
     CommandedArm, Motion, MotionLimits, Mover, OnLoss, Reply, Request, Setpoint, SharedWithOwner,
-    reason_of,
+    max_stop_duration, reason_of,
 };
 use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
@@ -163,8 +163,9 @@ impl ArmLoop {
             if self.is_shutting_down.load(Ordering::Relaxed) {
                 // The deadline is fixed at the first pass. Computing it anew in each pass would
                 // move it into the future forever.
-                let shutdown_by = *shutdown_deadline
-                    .get_or_insert_with(|| clock::now() + self.max_stop_duration());
+                let shutdown_by = *shutdown_deadline.get_or_insert_with(|| {
+                    clock::now() + max_stop_duration(&self.config.motion.limits) + STOP_MARGIN
+                });
                 if self.is_at_rest() || clock::now() > shutdown_by {
                     break;
                 }
@@ -517,25 +518,6 @@ impl ArmLoop {
             ArmState::Moving => self.mover.come_to_rest(),
             _ => true,
         }
-    }
-
-    /// Maximum time for the arm to come to rest.
-    fn max_stop_duration(&self) -> Duration {
-        // In the worst case, a joint at full velocity still has its full acceleration in the
-        // direction of motion. Reducing that acceleration to zero takes `a / j`. Then the joint
-        // decelerates from `v` in `v / a`, plus `a / j` for the two ramps of the deceleration.
-        let secs = |joint: &MotionLimits| {
-            joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk
-        };
-        // The joints stop independently, so the slowest one counts.
-        let max_secs = self
-            .config
-            .motion
-            .limits
-            .iter()
-            .map(secs)
-            .fold(0.0, f64::max);
-        Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
     /// Sends the fail-safe command, and resends it to motors that may not have received it.

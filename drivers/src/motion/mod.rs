@@ -188,4 +188,23 @@ impl MotionLimits {
             jerk: acceleration / jerk_secs,
         }
     }
+
+    /// Maximum time for a joint to come to rest.
+    fn max_stop_secs(&self) -> f64 {
+        // In the worst case, a joint at full velocity still has its full acceleration in the
+        // direction of motion. Reducing that acceleration to zero takes `a / j`. Then the joint
+        // decelerates from `v` in `v / a`, plus `a / j` for the two ramps of the deceleration.
+        self.velocity / self.acceleration + 2.0 * self.acceleration / self.jerk
+    }
+}
+
+/// Maximum time for all joints of an arm to come to rest. They stop independently, so the slowest
+/// joint counts.
+#[cfg(target_os = "linux")]
+pub(crate) fn max_stop_duration(limits: &[MotionLimits]) -> Duration {
+    let max_secs = limits
+        .iter()
+        .map(MotionLimits::max_stop_secs)
+        .fold(0.0, f64::max);
+    Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO)
 }

@@ -525,6 +525,16 @@ mod tests {
         }
     }
 
+    /// A reading of the joints at this time in milliseconds.
+    fn reading_at(millis: i64) -> Sample {
+        Sample::Joints(JointState {
+            stamp: Stamp(millis * 1_000_000),
+            position: vec![0.25; 7],
+            velocity: vec![],
+            effort: vec![],
+        })
+    }
+
     #[test]
     fn full_disk_is_error_and_written_samples_stay_readable() {
         let folder = tempfile::tempdir().expect("a folder");
@@ -536,17 +546,8 @@ mod tests {
         }));
         let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default())
             .expect("the header fits on the disk");
-        let reading = |ix: i64| {
-            let position = vec![0.25; 7];
-            Sample::Joints(JointState {
-                stamp: Stamp(ix * 1_000_000),
-                position,
-                velocity: vec![],
-                effort: vec![],
-            })
-        };
         let error = (0..20_000)
-            .map(|ix| recorder.write(&reading(ix)))
+            .map(|ix| recorder.write(&reading_at(ix)))
             .find_map(Result::err)
             .expect("the disk is full");
         let Error::Record { recorded, .. } = error else {
@@ -563,14 +564,14 @@ mod tests {
             "{error:?}"
         );
         assert!(
-            recorder.write(&reading(0)).is_err(),
+            recorder.write(&reading_at(0)).is_err(),
             "writing after a failure fails"
         );
         drop(recorder);
         let mut recording = Recording::open(&path).expect("a recording");
         let mut n_samples = 0_i64;
         while let Some(sample) = recording.next_sample().expect("readable") {
-            assert_eq!(sample, reading(n_samples));
+            assert_eq!(sample, reading_at(n_samples));
             n_samples += 1;
         }
         // Samples of the truncated chunk count, too, because the error reports how many samples can
@@ -602,17 +603,8 @@ mod tests {
         });
         let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default())
             .expect("the header fits on the disk");
-        let reading = |ix: i64| {
-            let position = vec![0.25; 7];
-            Sample::Joints(JointState {
-                stamp: Stamp(ix * 1_000_000),
-                position,
-                velocity: vec![],
-                effort: vec![],
-            })
-        };
         let error = (0..2000)
-            .map(|ix| recorder.write(&reading(ix)))
+            .map(|ix| recorder.write(&reading_at(ix)))
             .find_map(Result::err)
             .expect("the disk is full");
         assert!(
