@@ -228,8 +228,7 @@ fn page_renders_scene_and_overlays_correctly() {
     .expect("a free port");
     let render_thread = RenderThread::start(hub.clone());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
 
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
@@ -280,7 +279,6 @@ fn page_renders_scene_and_overlays_correctly() {
 
     drop(browser);
     drop(render_thread);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Returns to the first view, and waits for its full picture.
@@ -710,10 +708,8 @@ fn page_shows_connection_loss_and_run_result() {
     let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address(), LINK);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-link-{}", std::process::id()));
     let mut browser = Browser::open(
         &program,
-        &profile,
         &format!("http://{}/", proxy.address()),
         DESKTOP_PX,
     );
@@ -821,7 +817,6 @@ fn page_shows_connection_loss_and_run_result() {
     save_screenshot(&mut browser, "finished");
     drop(browser);
     drop(render_thread);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Records, at every change of the page, when the banner appears and whether a label says `live`.
