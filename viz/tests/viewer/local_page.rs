@@ -220,7 +220,6 @@ fn local_drawing_equals_the_pictures_of_the_server() {
         hub.clone(),
     )
     .expect("a free port");
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")

@@ -707,7 +707,6 @@ fn page_shows_connection_loss_and_run_result() {
     .expect("a free port");
     let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address(), LINK);
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let mut browser = Browser::open(
         &program,
         &format!("http://{}/", proxy.address()),
