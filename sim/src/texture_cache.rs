@@ -65,7 +65,7 @@ impl Cache {
         from_bytes(&bytes, &self.version)
     }
 
-    fn write(&self, path: &Path, textures: &Textures) -> std::io::Result<()> {
+    fn write(&self, path: &Path, textures: &[(String, Vec<u8>)]) -> std::io::Result<()> {
         std::fs::create_dir_all(&self.folder)?;
         files::write(path, to_bytes(textures, &self.version))
     }
@@ -73,7 +73,7 @@ impl Cache {
 
 /// The contents of a file: the version, then name and PNG file of each texture, then a checksum of
 /// all of them. The length comes before each part.
-fn to_bytes(textures: &Textures, version: &str) -> Vec<u8> {
+fn to_bytes(textures: &[(String, Vec<u8>)], version: &str) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut add = |part: &[u8]| {
         bytes.extend((part.len() as u64).to_le_bytes());
