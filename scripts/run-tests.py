@@ -44,8 +44,9 @@ COMPUTING = (
 # processor.
 NICE = 10
 # Programs that start first, because they take longest. The other programs follow in the order of
-# their names.
-FIRST = ("fieldrig program", "trainer unit")
+# their names. The tests with a browser wait most, so they run while programs that only compute are
+# left to fill these times.
+FIRST = ("viz viewer", "fieldrig program", "trainer unit")
 # With --quick, only programs with unit tests run. The modules in this list are left out, because
 # their tests need a GPU. No GPU is visible to the programs, so a test that needs one fails unless
 # its module is listed here.

@@ -20,8 +20,11 @@ mod open_gpu;
 mod page_args;
 mod permission_args;
 mod print;
+#[cfg(feature = "sim")]
+mod scene_cache;
 mod signals;
 mod training_args;
+mod user_folders;
 mod version;
 mod work_lines;
 
@@ -39,6 +42,8 @@ fn main() -> ExitCode {
         // New folders get the mode 0700, and new files 0600.
         rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
     }
+    #[cfg(feature = "sim")]
+    scene_cache::start();
     let result = signals::fail_writes_at_size_limit()
         .and_then(|()| start_threads())
         .and_then(|()| cli.command.run());

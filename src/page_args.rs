@@ -1,6 +1,6 @@
 //! Flags for the address of the page, and who may open it.
 
-use crate::print;
+use crate::{print, user_folders};
 use anyhow::Context;
 use messages::{BadInput, quoted_for_shell};
 use qrcode::QrCode;
@@ -137,20 +137,12 @@ fn qr_code(text: &str) -> anyhow::Result<String> {
 
 /// The user's folder for data of this program.
 fn data_folder() -> Result<PathBuf, BadInput> {
-    let given = std::env::var_os("XDG_DATA_HOME")
-        .map(PathBuf::from)
-        // The XDG specification says to ignore relative paths.
-        .filter(|folder| folder.is_absolute());
-    let in_home = || Some(std::env::home_dir()?.join(".local/share"));
-    given
-        .or_else(in_home)
-        .map(|folder| folder.join("fieldrig"))
-        .ok_or_else(|| {
-            BadInput(
-                "there is no home folder for the TLS certificate: set HOME, or use --certificate"
-                    .to_owned(),
-            )
-        })
+    user_folders::data().ok_or_else(|| {
+        BadInput(
+            "there is no home folder for the TLS certificate: set HOME, or use --certificate"
+                .to_owned(),
+        )
+    })
 }
 
 #[cfg(test)]

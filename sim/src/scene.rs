@@ -5,6 +5,7 @@ use crate::config::{Config, Parent, Scene, TargetParent};
 use crate::convex_pieces::convex_pieces;
 use crate::objects::{self, Object};
 use crate::texture::Texture;
+use crate::texture_cache::{self, Textures};
 use crate::twin::{Pedestal, RobotBody, RobotConfig, TwinPlan};
 use crate::{Error, cabinet, lab, light, panda, printed_target};
 use kinematics::Transform;
@@ -67,7 +68,7 @@ fn build_with(
     // then meshes.
     for (name, png) in &scene_assets.textures_png {
         add_file(&mut files, &format!("{name}.png"), png)?;
-        let specular = if *name == "metal" { 0.25 } else { 0.03 };
+        let specular = if name == "metal" { 0.25 } else { 0.03 };
         let _ = writeln!(
             assets,
             "<texture name=\"{name}\" type=\"2d\" file=\"{name}.png\"/>\n\
@@ -301,7 +302,7 @@ fn extra_materials(scene: Scene) -> &'static str {
 /// Assets of a scene. They are created once per process, because this takes a second and does not
 /// depend on the configuration.
 struct SceneAssets {
-    textures_png: Vec<(&'static str, Vec<u8>)>,
+    textures_png: Textures,
     objects: Vec<Object>,
 }
 
@@ -314,16 +315,12 @@ impl SceneAssets {
         if let Some(scene_assets) = all.get(scene.name()) {
             return Ok(Arc::clone(scene_assets));
         }
-        let (textures, objects) = match scene {
-            Scene::StaticArm => (objects::textures(), objects::objects()),
-            Scene::MobileBase => (lab::textures(), lab::objects()),
-            Scene::MobileArm => (cabinet::textures(), cabinet::objects()),
+        let objects = match scene {
+            Scene::StaticArm => objects::objects(),
+            Scene::MobileBase => lab::objects(),
+            Scene::MobileArm => cabinet::objects(),
         };
-        // Compression takes most of the time, so textures are compressed in parallel.
-        let textures_png = textures
-            .into_par_iter()
-            .map(encode_texture)
-            .collect::<Result<_, _>>()?;
+        let textures_png = texture_cache::textures(scene.name(), || create_textures(scene))?;
         let scene_assets = Arc::new(Self {
             textures_png,
             objects,
@@ -333,13 +330,22 @@ impl SceneAssets {
     }
 }
 
+/// Paints and lights the textures of a scene.
+fn create_textures(scene: Scene) -> Result<Textures, Error> {
+    let textures = match scene {
+        Scene::StaticArm => objects::textures(),
+        Scene::MobileBase => lab::textures(),
+        Scene::MobileArm => cabinet::textures(),
+    };
+    // Compression takes long, so textures are compressed in parallel.
+    textures.into_par_iter().map(encode_texture).collect()
+}
+
 /// A texture as the bytes of a PNG file.
-fn encode_texture(
-    (name, texture): (&'static str, Texture),
-) -> Result<(&'static str, Vec<u8>), Error> {
+fn encode_texture((name, texture): (&'static str, Texture)) -> Result<(String, Vec<u8>), Error> {
     texture
         .to_png()
-        .map(|png| (name, png))
+        .map(|png| (name.to_owned(), png))
         .map_err(|source| Error::Texture {
             name: name.to_owned(),
             source,

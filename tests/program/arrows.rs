@@ -22,7 +22,7 @@ const ALLOWED: &str = "
     model-files   -> files kinematics numbers
     targets       -> kinematics messages numbers
     calibration   -> background keyframe kinematics messages numbers
-    sim           -> drivers kinematics messages numbers targets
+    sim           -> drivers files kinematics messages numbers targets
     capture       -> background calibration drivers files keyframe kinematics messages numbers sim
     report        -> calibration files kinematics messages numbers
     trainer       -> background calibration files gpu keyframe kinematics messages model-files \

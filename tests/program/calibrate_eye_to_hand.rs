@@ -58,7 +58,7 @@ fn write_rig(folder: &Path, parent: &str) {
     let urdf = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/robots/panda.urdf");
     let rig = format!(
         "[arm]\ndriver = \"sim\"\nurdf = {:?}\nflange_link = \"panda_link8\"\n\
-         [camera.front]\ndriver = \"sim\"\nsize_px = [640, 480]\nrate_hz = 5\nexposure_micros = 1000\n\
+         [camera.front]\ndriver = \"sim\"\nsize_px = [640, 480]\nrate_hz = 2\nexposure_micros = 1000\n\
          readout_micros = 0\nparent = {parent:?}\nparent_from_camera = {}\n\
          intrinsics = {{ focal_px = [614.6, 614.2], principal_px = [323.7, 236.4], lens = \"pinhole\" }}\n\
          [camera.front.sim]\nsupersample = 2\n[camera.front.sim.truth]\nparent_from_camera = {}\n\

@@ -11,7 +11,7 @@ use crate::wire_session::{RecordingProxy, Session};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -49,13 +49,13 @@ window.createImageBitmap = async (blob, options) => {
 };";
 
 /// Opens a page without WebGL.
-fn open(program: &Path, profile: &Path, url: &str, delay_millis: u32) -> Browser {
+fn open(program: &Path, url: &str, delay_millis: u32) -> Browser {
     let script = format!("{NO_DRAWING}{COUNT_DECODERS}window.decoders.delay = {delay_millis};");
-    Browser::open_with(program, profile, url, WINDOW_PX, &script)
+    Browser::open_with(program, url, WINDOW_PX, &script)
 }
 
 /// What the page receives while a simulated rig is trained on, and the report of the run.
-fn record(program: &Path, profile: &Path) -> (Session, Value) {
+fn record(program: &Path) -> (Session, Value) {
     let folder = tempfile::tempdir().expect("a folder");
     small_rig::write(folder.path(), small_rig::Pace::RealTime);
     let args = [
@@ -86,7 +86,7 @@ fn record(program: &Path, profile: &Path) -> (Session, Value) {
         .and_then(|url| url.strip_prefix("http://"))
         .expect("a URL");
     let proxy = RecordingProxy::start(address.trim_end_matches('/').parse().expect("an address"));
-    let mut browser = open(program, profile, &proxy.url(), 0);
+    let mut browser = open(program, &proxy.url(), 0);
     wait_for(&mut browser, "a picture", |browser| {
         browser.text("picture-text").contains(" ms")
     });
@@ -115,7 +115,6 @@ fn record(program: &Path, profile: &Path) -> (Session, Value) {
 /// A page that receives a session.
 struct Replay {
     browser: Browser,
-    profile: PathBuf,
     is_over: Arc<AtomicBool>,
 }
 
@@ -124,10 +123,8 @@ impl Replay {
         let is_over: Arc<AtomicBool> = Arc::default();
         let (session, is_over_here) = (session.clone(), Arc::clone(&is_over));
         let server = PageServer::start(move |socket| session.play(socket, speed, &is_over_here));
-        let profile = profile(&format!("{speed}-{delay_millis}"));
         Self {
-            browser: open(program, &profile, &server.url(), delay_millis),
-            profile,
+            browser: open(program, &server.url(), delay_millis),
             is_over,
         }
     }
@@ -135,13 +132,7 @@ impl Replay {
     fn end(self) {
         self.is_over.store(true, Ordering::Relaxed);
         drop(self.browser);
-        std::fs::remove_dir_all(&self.profile).expect("the browser has left its profile");
     }
-}
-
-fn profile(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-replay-{name}-{}", std::process::id()))
 }
 
 #[test]
@@ -149,9 +140,7 @@ fn a_recorded_session_keeps_the_main_thread_free_and_outdated_images_are_dropped
     let Some(program) = browser_for_page() else {
         return;
     };
-    let recording = profile("recording");
-    let (session, report) = record(&program, &recording);
-    std::fs::remove_dir_all(&recording).expect("the browser has left its profile");
+    let (session, report) = record(&program);
     let [pictures, images] = ["picture", "live_image"].map(|kind| session.binaries(kind));
     check_report(&report);
     check_times(&pictures);

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use sim::{PinholeView, RobotMasks, Scene};
 use std::io::{BufRead, BufReader, ErrorKind};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -339,9 +339,7 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
     });
     let talking = Arc::clone(&stage);
     let server = PageServer::start(move |socket| talking.talk(socket));
-    let profile: PathBuf = Path::new(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-silhouette-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -383,5 +381,4 @@ fn silhouette_of_a_simulated_robot_matches_the_simulator() {
         );
     }
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

@@ -1,12 +1,17 @@
 //! Headless Chromium, driven over its debugging protocol.
 //!
+//! Starting Chromium takes about 2 s of computing time, and opening an empty page in a running one
+//! half a second. Tests therefore use the browsers of earlier tests. No two tests use a browser at
+//! the same time, and each test has a browser context of its own, without data of earlier pages.
+//!
 //! All functions panic if the browser does not answer.
 
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
 
@@ -31,10 +36,40 @@ const SWIFTSHADER: [&str; 2] = ["--use-angle=swiftshader", "--enable-unsafe-swif
 /// that the browser has already shown the hint. Pages without an origin have no storage.
 const LATER_VISIT: &str = "try { localStorage.setItem('gestures-seen', '1'); } catch {}\n";
 
-/// A running browser with one page.
+/// Runs a browser until standard input is closed, then removes its profile. Standard input is also
+/// closed when a test program ends or is killed, so no browser survives its tests. The shell gives
+/// commands in the background no standard input, so it is copied first.
+const RUN_UNTIL_CLOSED: &str = r#"
+profile=$(mktemp -d)
+exec 3<&0
+"$@" --user-data-dir="$profile" about:blank 3<&- &
+browser=$!
+{ cat <&3; kill $browser; } >/dev/null 2>&1 &
+exec 3<&-
+wait $browser
+rm -rf "$profile"
+"#;
+
+/// Size of the window of a browser. Pages have their own sizes.
+const BROWSER_PX: [u32; 2] = [1280, 760];
+
+/// Browsers that no test uses. There are at most as many as tests run at the same time.
+static IDLE: Mutex<Vec<Process>> = Mutex::new(Vec::new());
+
+/// A running browser.
+struct Process {
+    shell: Child,
+    /// The browser ends when this is closed.
+    stdin: Option<ChildStdin>,
+    /// Address of its debugging protocol.
+    address: String,
+}
+
+/// A page in a browser, which no other test uses meanwhile.
 pub struct Browser {
-    process: Child,
+    process: Option<Process>,
     socket: WebSocket<TcpStream>,
+    context: String,
     session: String,
     n_calls: u64,
 }
@@ -78,38 +113,13 @@ pub struct Task {
     pub cpu_millis: f64,
 }
 
-impl Browser {
-    /// Opens a page of this size in CSS pixels; the profile folder must be empty.
-    pub fn open(program: &Path, profile: &Path, url: &str, size_px: [u32; 2]) -> Self {
-        Self::open_with(program, profile, url, size_px, "")
-    }
-
-    /// Does the same as [`Browser::open`], and runs a script before the page's own scripts.
-    pub fn open_with(
-        program: &Path,
-        profile: &Path,
-        url: &str,
-        size_px: [u32; 2],
-        script: &str,
-    ) -> Self {
-        let mut browser = Self::start(program, profile, size_px, &MESA);
-        let has_webgl = "document.createElement('canvas').getContext('webgl2') !== null";
-        if browser.evaluate(has_webgl) != true {
-            drop(browser);
-            browser = Self::start(program, profile, size_px, &SWIFTSHADER);
-        }
-        browser.call("Page.enable", json!({}));
-        browser.call(
-            "Page.addScriptToEvaluateOnNewDocument",
-            json!({"source": format!("{LATER_VISIT}{script}")}),
-        );
-        browser.call("Page.navigate", json!({"url": url}));
-        browser
-    }
-
-    /// Starts the browser with an empty page of this size in CSS pixels.
-    fn start(program: &Path, profile: &Path, [width, height]: [u32; 2], webgl: &[&str]) -> Self {
-        let mut process = Command::new(program)
+impl Process {
+    /// Starts a browser with these flags for WebGL.
+    fn start(program: &Path, webgl: &[&str]) -> Self {
+        let [width, height] = BROWSER_PX;
+        let mut shell = Command::new("sh")
+            .args(["-c", RUN_UNTIL_CLOSED, "sh"])
+            .arg(program)
             .args([
                 "--headless",
                 "--no-sandbox",
@@ -120,6 +130,7 @@ impl Browser {
             .args([
                 "--disable-background-networking",
                 "--disable-component-update",
+                "--disable-extensions",
                 "--disable-sync",
             ])
             .args(webgl)
@@ -127,13 +138,13 @@ impl Browser {
             .args(["--hide-scrollbars", "--remote-debugging-port=0"])
             .arg("--force-device-scale-factor=1")
             .arg(format!("--window-size={width},{height}"))
-            .arg(format!("--user-data-dir={}", profile.display()))
-            .arg("about:blank")
+            .stdin(Stdio::piped())
             .stderr(Stdio::piped())
             .stdout(Stdio::null())
             .spawn()
-            .expect("chromium starts");
-        let mut lines = BufReader::new(process.stderr.take().expect("stderr is piped")).lines();
+            .expect("sh starts");
+        let stdin = shell.stdin.take();
+        let mut lines = BufReader::new(shell.stderr.take().expect("stderr is piped")).lines();
         let address = lines
             .by_ref()
             .map_while(Result::ok)
@@ -144,31 +155,89 @@ impl Browser {
             .expect("chromium prints its debugging address");
         // The pipe is drained, because the browser would block once it is full.
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
-        let host = address
+        Self {
+            shell,
+            stdin,
+            address,
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        drop(self.stdin.take());
+        let _ = self.shell.wait();
+    }
+}
+
+impl Browser {
+    /// Opens a page of this size in CSS pixels.
+    pub fn open(program: &Path, url: &str, size_px: [u32; 2]) -> Self {
+        Self::open_with(program, url, size_px, "")
+    }
+
+    /// Does the same as [`Browser::open`], and runs a script before the page's own scripts.
+    pub fn open_with(program: &Path, url: &str, size_px: [u32; 2], script: &str) -> Self {
+        let idle = IDLE.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut browser = match idle {
+            Some(process) => Self::in_process(process),
+            None => Self::start(program),
+        };
+        browser.resize(size_px);
+        browser.call("Page.enable", json!({}));
+        browser.call(
+            "Page.addScriptToEvaluateOnNewDocument",
+            json!({"source": format!("{LATER_VISIT}{script}")}),
+        );
+        browser.call("Page.navigate", json!({"url": url}));
+        browser
+    }
+
+    /// Starts a browser that supports WebGL.
+    fn start(program: &Path) -> Self {
+        let mut browser = Self::in_process(Process::start(program, &MESA));
+        let has_webgl = "document.createElement('canvas').getContext('webgl2') !== null";
+        if browser.evaluate(has_webgl) != true {
+            browser.end();
+            browser = Self::in_process(Process::start(program, &SWIFTSHADER));
+        }
+        browser
+    }
+
+    /// Opens an empty page in a running browser.
+    fn in_process(process: Process) -> Self {
+        let host = process
+            .address
             .trim_start_matches("ws://")
             .split('/')
             .next()
             .expect("a host");
         let stream = TcpStream::connect(host).expect("chromium listens");
         stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
-        let (socket, _) = tungstenite::client(&address, stream).expect("a WebSocket");
+        let (socket, _) = tungstenite::client(&process.address, stream).expect("a WebSocket");
         let mut browser = Self {
-            process,
+            process: Some(process),
             socket,
+            context: String::new(),
             session: String::new(),
             n_calls: 0,
         };
-        let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));
+        let text = |value: &Value| value.as_str().expect("an identifier").to_owned();
+        let context = browser.call("Target.createBrowserContext", json!({}));
+        browser.context = text(&context["browserContextId"]);
+        let page = json!({"url": "about:blank", "browserContextId": browser.context});
+        let target = browser.call("Target.createTarget", page);
         let attached = browser.call(
             "Target.attachToTarget",
             json!({"targetId": target["targetId"], "flatten": true}),
         );
-        browser.session = attached["sessionId"]
-            .as_str()
-            .expect("a session")
-            .to_owned();
-        browser.resize([width, height]);
+        browser.session = text(&attached["sessionId"]);
         browser
+    }
+
+    /// Ends the browser, so that no other test uses it.
+    fn end(&mut self) {
+        self.process = None;
     }
 
     /// Changes the window's size in CSS pixels.
@@ -318,14 +387,20 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // A browser that was asked to close also ends its own child processes.
-        self.session.clear();
-        let close = json!({"id": 0, "method": "Browser.close"});
-        let asked = self.socket.send(Message::text(close.to_string())).is_ok();
-        if !asked && self.process.kill().is_err() {
-            return;
+        // After a failure, the state of the browser is unknown.
+        if std::thread::panicking() {
+            self.end();
         }
-        let _ = self.process.wait();
+        let Some(process) = self.process.take() else {
+            return;
+        };
+        // The answer comes when the page has been closed.
+        self.session.clear();
+        let context = json!({"browserContextId": self.context});
+        self.call("Target.disposeBrowserContext", context);
+        IDLE.lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(process);
     }
 }
 

@@ -7,7 +7,7 @@ use crate::models::{self, ModelThread, splat_model, tsdf_model, wall};
 use crate::proxy::{Link, Proxy};
 use crate::request_thread::RequestThread;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -35,15 +35,6 @@ fn start_server(listen: SocketAddr, hub: &Hub) -> Server {
 
 fn any_port() -> SocketAddr {
     ([127, 0, 0, 1], 0).into()
-}
-
-fn profile(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-black-{name}-{}", std::process::id()))
-}
-
-fn remove(profile: &Path) {
-    std::fs::remove_dir_all(profile).expect("the browser has left its profile");
 }
 
 /// Checks that the middle of the view shows something. Tools and texts are outside the middle.
@@ -168,8 +159,7 @@ fn the_page_says_what_happens_until_there_is_a_picture() {
     });
     // Dropped before the thread, which waits as long as pictures are held back.
     let _release = pictures.clone();
-    let profile = profile("startup");
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
 
     check_startup(&mut browser, &hub, &pictures);
     check_reload_while_scoring(&mut browser, &hub, &pictures);
@@ -179,7 +169,6 @@ fn the_page_says_what_happens_until_there_is_a_picture() {
     drop(browser);
     drop(thread);
     drop(server);
-    remove(&profile);
 }
 
 /// From the connection to the first picture with content.
@@ -320,9 +309,8 @@ fn local_drawing_keeps_what_is_on_screen_until_its_chunks_are_there() {
     let server = start_server(any_port(), &hub);
     let listen = server.address();
     let proxy = Proxy::start(listen, SLOW_LINK);
-    let profile = profile("local");
     let url = format!("http://{}/", proxy.address());
-    let mut browser = Browser::open(&program, &profile, &url, WINDOW_PX);
+    let mut browser = Browser::open(&program, &url, WINDOW_PX);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -363,5 +351,4 @@ fn local_drawing_keeps_what_is_on_screen_until_its_chunks_are_there() {
     drop(browser);
     drop(thread.finish());
     drop(server);
-    remove(&profile);
 }

@@ -4,7 +4,6 @@
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 use kinematics::Stamp;
-use std::path::PathBuf;
 use std::time::Instant;
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use viz::{
@@ -99,9 +98,7 @@ fn coverage_is_drawn_over_the_live_image_and_listed() {
     hub.set_status(guided(Some(coverage())));
     let listen = ([127, 0, 0, 1], 0).into();
     let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-coverage-{}", std::process::id()));
-    let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
+    let mut browser = Browser::open_with(&program, &server.url(), WINDOW_PX, NO_DRAWING);
 
     // The list needs no image.
     wait_for(&mut browser, "the list", |browser| {
@@ -149,5 +146,4 @@ fn coverage_is_drawn_over_the_live_image_and_listed() {
             && browser.evaluate("document.getElementById('photograph-coverage')?.hidden") == true
     });
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

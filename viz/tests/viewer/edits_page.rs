@@ -211,9 +211,8 @@ fn operators_crop_edit_and_measure() {
         pending.deliver(picture);
     });
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("edits-{}", std::process::id()));
     let mut page = Page {
-        browser: Browser::open(&program, &profile, &server.url(), WINDOW_PX),
+        browser: Browser::open(&program, &server.url(), WINDOW_PX),
         hub,
         last,
     };
@@ -233,7 +232,6 @@ fn operators_crop_edit_and_measure() {
 
     drop(page);
     drop(thread);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Several distances are shown, without covering their points, until they are removed. They are

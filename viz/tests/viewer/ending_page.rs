@@ -81,11 +81,6 @@ impl Served {
     }
 }
 
-fn profile(name: &str) -> PathBuf {
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    scratch.join(format!("chromium-{name}-{}", std::process::id()))
-}
-
 fn save_screenshot(browser: &mut Browser, name: &str) {
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     std::fs::write(
@@ -266,9 +261,8 @@ fn end_of_a_run_is_a_state_of_the_page() {
     let folder = tempfile::tempdir().expect("a folder");
     let served = Served::start(training());
     let proxy = Proxy::start(served.server.address(), LINK);
-    let profile = profile("ending");
     let url = format!("http://{}/", proxy.address());
-    let mut browser = Browser::open(&program, &profile, &url, DESKTOP_PX);
+    let mut browser = Browser::open(&program, &url, DESKTOP_PX);
     wait_for_full_picture(&mut browser);
     wait_until(
         &mut browser,
@@ -283,7 +277,6 @@ fn end_of_a_run_is_a_state_of_the_page() {
     check_frozen_server(&mut browser, &proxy);
     check_local_drawing_after_the_end(&mut browser, served);
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// The panel has the verdict, the folder, the problems and working links; the page shows one PSNR.
@@ -553,8 +546,7 @@ fn saved_models_and_files_have_a_panel_of_their_own() {
     let path = folder.path().join("guitar.spz");
     std::fs::write(&path, "spz").expect("written");
     publish_view(&served.hub, SourceKind::File, &path);
-    let profile = profile("source");
-    let mut browser = Browser::open(&program, &profile, &served.server.url(), DESKTOP_PX);
+    let mut browser = Browser::open(&program, &served.server.url(), DESKTOP_PX);
     wait_for_full_picture(&mut browser);
     check_file(&mut browser);
     check_up_axis(&mut browser, &served);
@@ -562,7 +554,6 @@ fn saved_models_and_files_have_a_panel_of_their_own() {
     check_incomplete_map(&mut browser, &served.hub);
     check_end_of_view(&mut browser, served);
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Whether the element with this id is shown, also if its panel is closed or missing.

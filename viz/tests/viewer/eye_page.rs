@@ -10,7 +10,6 @@ use analytic_scene::draw_boxes;
 use kinematics::Transform;
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -129,13 +128,12 @@ pub(crate) struct Page {
     pub(crate) browser: Browser,
     pub(crate) renderer: Renderer,
     pub(crate) hub: Hub,
-    profile: PathBuf,
     _server: Server,
 }
 
 impl Page {
     /// `None` without Chromium.
-    pub(crate) fn open(name: &str, has_panoramas: bool, radius_m: f64) -> Option<Self> {
+    pub(crate) fn open(has_panoramas: bool, radius_m: f64) -> Option<Self> {
         let program = browser_for_page()?;
         let alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
         let hub = Hub::new();
@@ -153,15 +151,12 @@ impl Page {
         renderer
             .has_panoramas
             .store(has_panoramas, Ordering::Relaxed);
-        let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-        let profile = scratch.join(format!("chromium-{name}-{}", std::process::id()));
-        let browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
+        let browser = Browser::open_with(&program, &server.url(), WINDOW_PX, NO_DRAWING);
         let mut page = Self {
             _alone: alone,
             browser,
             renderer,
             hub,
-            profile,
             _server: server,
         };
         page.rest();
@@ -276,13 +271,11 @@ impl Page {
             browser,
             renderer,
             hub: _,
-            profile,
             _server: server,
             _alone: alone,
         } = self;
         drop(browser);
         drop((renderer, server));
-        std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
         drop(alone);
     }
 }
@@ -303,7 +296,7 @@ impl Random {
 
 #[test]
 fn the_eye_stays_in_front_of_walls() {
-    let Some(mut page) = Page::open("eye", true, RADIUS_M) else {
+    let Some(mut page) = Page::open(true, RADIUS_M) else {
         return;
     };
     assert!((page.renderer.eye() - FIRST_EYE.coords).norm() < 1e-6);
@@ -354,7 +347,7 @@ fn the_eye_stays_in_front_of_walls() {
 
 #[test]
 fn an_eye_that_has_passed_an_unknown_wall_returns() {
-    let Some(mut page) = Page::open("return", false, RADIUS_M) else {
+    let Some(mut page) = Page::open(false, RADIUS_M) else {
         return;
     };
     // Backward, where no picture shows the wall.
@@ -385,7 +378,7 @@ fn an_eye_that_has_passed_an_unknown_wall_returns() {
 #[test]
 fn the_eye_passes_a_surface_that_is_gone() {
     for (name, step, edits) in [("erased", 1, 1), ("trained", 2, 0)] {
-        let Some(mut page) = Page::open(name, true, RADIUS_M) else {
+        let Some(mut page) = Page::open(true, RADIUS_M) else {
             return;
         };
         page.set_model(1, 0);
@@ -417,7 +410,7 @@ fn the_eye_passes_a_surface_that_is_gone() {
 #[test]
 fn surroundings_are_requested_only_where_they_are_needed() {
     // Half of this radius is much less than the distance of the eye to the walls.
-    let Some(mut page) = Page::open("surroundings", true, 0.6) else {
+    let Some(mut page) = Page::open(true, 0.6) else {
         return;
     };
     wait_for(&mut page.browser, "the first surroundings", |_| {
@@ -446,7 +439,7 @@ fn surroundings_are_requested_only_where_they_are_needed() {
 
 #[test]
 fn keys_and_thumbs_fly() {
-    let Some(mut page) = Page::open("fly", true, RADIUS_M) else {
+    let Some(mut page) = Page::open(true, RADIUS_M) else {
         return;
     };
     const TIME: Duration = Duration::from_millis(250);

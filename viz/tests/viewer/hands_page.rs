@@ -9,7 +9,6 @@ use crate::robot;
 use analytic_scene::{draw, looking_along_y};
 use nalgebra::{Translation3, Vector3};
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
@@ -72,14 +71,13 @@ struct Page {
     browser: Browser,
     hub: Hub,
     requests: Arc<Mutex<Vec<RenderRequest>>>,
-    profile: PathBuf,
     renderer: RequestThread,
     server: Server,
 }
 
 impl Page {
     /// `None` without Chromium.
-    fn open(name: &str, size_px: [u32; 2], script: &str) -> Option<Self> {
+    fn open(size_px: [u32; 2], script: &str) -> Option<Self> {
         let program = browser_for_page()?;
         let hub = Hub::new();
         hub.set_scene_hint(SceneHint {
@@ -99,15 +97,12 @@ impl Page {
             let picture = draw(&pending.request);
             pending.deliver(picture);
         });
-        let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-            .join(format!("chromium-hands-{name}-{}", std::process::id()));
         let script = format!("{NO_DRAWING}{script}");
-        let browser = Browser::open_with(&program, &profile, &server.url(), size_px, &script);
+        let browser = Browser::open_with(&program, &server.url(), size_px, &script);
         let mut page = Self {
             browser,
             hub,
             requests,
-            profile,
             renderer,
             server,
         };
@@ -118,10 +113,8 @@ impl Page {
     }
 
     fn close(self) {
-        let profile = self.profile.clone();
         drop(self.browser);
         drop((self.renderer, self.server));
-        std::fs::remove_dir_all(profile).expect("the browser has left its profile");
     }
 
     fn wait(&mut self, what: &str, is_there: impl FnMut(&mut Browser) -> bool) {
@@ -253,7 +246,7 @@ fn status() -> Status {
 
 #[test]
 fn the_page_can_be_used_with_keys_alone() {
-    let Some(mut page) = Page::open("keys", DESKTOP_PX, FIRST_VISIT) else {
+    let Some(mut page) = Page::open(DESKTOP_PX, FIRST_VISIT) else {
         return;
     };
     check_gesture_hint(&mut page);
@@ -606,7 +599,7 @@ fn check_announcements(page: &mut Page) {
 #[test]
 fn the_page_can_be_used_with_a_thumb() {
     let script = format!("{FIRST_VISIT}{TOUCH_ONLY}");
-    let Some(mut page) = Page::open("phone", PHONE_PX, &script) else {
+    let Some(mut page) = Page::open(PHONE_PX, &script) else {
         return;
     };
     page.browser.call(

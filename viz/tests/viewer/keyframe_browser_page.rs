@@ -230,8 +230,7 @@ fn the_keyframe_browser_says_what_is_wrong_with_each_keyframe() {
         pending.deliver(picture);
     });
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-keyframes-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -247,7 +246,6 @@ fn the_keyframe_browser_says_what_is_wrong_with_each_keyframe() {
 
     drop(browser);
     drop(renderer);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Presses a key while the panel has the focus.

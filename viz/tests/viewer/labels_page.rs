@@ -9,7 +9,7 @@ use keyframe::RangePoints;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, Vector3};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -144,12 +144,11 @@ struct Page {
     browser: Browser,
     hub: Hub,
     models: Models,
-    profile: PathBuf,
     _server: Server,
 }
 
 impl Page {
-    fn open(program: &Path, name: &str) -> Self {
+    fn open(program: &Path) -> Self {
         let hub = Hub::new();
         hub.set_scene_hint(SceneHint {
             center_m: [0.0, 0.0, 0.2],
@@ -162,29 +161,22 @@ impl Page {
         };
         let server = Server::start(config, hub.clone()).expect("a free port");
         let models = Models::start(hub.clone());
-        let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-        let profile = scratch.join(format!("chromium-{name}-{}", std::process::id()));
-        let mut browser = Browser::open(program, &profile, &server.url(), WINDOW_PX);
+        let mut browser = Browser::open(program, &server.url(), WINDOW_PX);
         wait_for(&mut browser, "a complete picture", is_current);
         Self {
             browser,
             hub,
             models,
-            profile,
             _server: server,
         }
     }
 
     fn close(self) {
         let Self {
-            browser,
-            models,
-            profile,
-            ..
+            browser, models, ..
         } = self;
         drop(browser);
         drop(models);
-        std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
     }
 }
 
@@ -223,7 +215,7 @@ fn the_label_describes_the_drawn_picture_at_any_moment() {
     let Some(program) = browser_for_page() else {
         return;
     };
-    let mut page = Page::open(&program, "labels");
+    let mut page = Page::open(&program);
     check_random_moments(&mut page.browser);
     check_late_picture(&mut page);
     check_other_model(&mut page);
@@ -372,7 +364,7 @@ fn the_header_and_the_panels_answer_the_questions_of_an_operator() {
     let Some(program) = browser_for_page() else {
         return;
     };
-    let mut page = Page::open(&program, "header");
+    let mut page = Page::open(&program);
     check_identity(&mut page.browser);
     check_counts(&mut page.browser);
     check_pause(&mut page);

@@ -198,9 +198,7 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     let (mut reference_splats, mut reference_tsdf) = (splat_model(&splats), tsdf_model(18));
     let thread = ModelThread::start(hub.clone(), models);
     let server = serve(&hub);
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-local-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -279,7 +277,6 @@ fn local_drawing_equals_the_pictures_of_the_server() {
     });
     drop(browser);
     drop(thread.finish());
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Number of pixels in the color of live cameras, which the model does not have.
@@ -340,9 +337,7 @@ fn local_splats_hide_what_lies_behind_them() {
     let models: models::Models = vec![("splat", Box::new(splat_model(&splats)))];
     let thread = ModelThread::start(hub.clone(), models);
     let server = serve(&hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-behind-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), [800, 500]);
+    let mut browser = Browser::open(&program, &server.url(), [800, 500]);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -384,7 +379,6 @@ fn local_splats_hide_what_lies_behind_them() {
     }
     drop(browser);
     drop(thread.finish());
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Green channel of the screenshot at a point in the world; `None` until a full picture was
@@ -453,9 +447,7 @@ fn local_splats_are_cut_at_the_sides_of_the_crop_box() {
         hub,
     )
     .expect("a free port");
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-cut-splat-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), [1280, 760]);
+    let mut browser = Browser::open(&program, &server.url(), [1280, 760]);
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -483,5 +475,4 @@ fn local_splats_are_cut_at_the_sides_of_the_crop_box() {
 
     drop(browser);
     drop(thread.finish());
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

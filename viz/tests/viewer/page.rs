@@ -223,8 +223,7 @@ fn page_renders_scene_and_overlays_correctly() {
     let server = serve(&hub);
     let render_thread = RenderThread::start(hub.clone());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
 
     wait_for(&mut browser, "a full picture", |browser| {
         browser.text("picture-text").contains("100 %")
@@ -275,7 +274,6 @@ fn page_renders_scene_and_overlays_correctly() {
 
     drop(browser);
     drop(render_thread);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Returns to the first view, and waits for its full picture.
@@ -698,11 +696,8 @@ fn page_shows_connection_loss_and_run_result() {
     let server = serve(&hub);
     let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address(), LINK);
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-link-{}", std::process::id()));
     let mut browser = Browser::open(
         &program,
-        &profile,
         &format!("http://{}/", proxy.address()),
         DESKTOP_PX,
     );
@@ -810,7 +805,6 @@ fn page_shows_connection_loss_and_run_result() {
     save_screenshot(&mut browser, "finished");
     drop(browser);
     drop(render_thread);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Records, at every change of the page, when the banner appears and whether a label says `live`.

@@ -3,7 +3,6 @@
 //! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 use crate::local_server::serve;
-use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -101,8 +100,6 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
         world_from_camera,
     });
     let server = serve(&hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-latency-{}", std::process::id()));
     let model = Model {
         hub: hub.clone(),
         keyframes: Mutex::new(TrainedKeyframes { n: 0, newest: None }),
@@ -113,8 +110,7 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
     (0..5).for_each(|_| model.add_keyframe());
     std::thread::scope(|scope| {
         scope.spawn(|| model.run());
-        let mut browser =
-            Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
+        let mut browser = Browser::open_with(&program, &server.url(), WINDOW_PX, NO_DRAWING);
         wait_for(&mut browser, "a full picture", |browser| {
             browser.text("picture-text").contains("100 %")
         });
@@ -166,7 +162,6 @@ fn time_from_the_camera_to_the_screen_is_shown_and_reported() {
         check_reports(&hub.pictures().take_shown(), total);
         model.is_over.store(true, Ordering::Relaxed);
     });
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// The run learns about the picture with the new keyframe.

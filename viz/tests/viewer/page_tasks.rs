@@ -7,7 +7,6 @@ use crate::local_server::serve;
 use crate::robot;
 use kinematics::{Stamp, Transform};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
@@ -107,14 +106,11 @@ fn tasks_of_the_main_thread_are_short() {
         world_from_camera: analytic_scene::looking_along_y(),
     });
     let server = serve(&hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-tasks-{}", std::process::id()));
     let is_over = AtomicBool::new(false);
     let tasks = std::thread::scope(|scope| {
         scope.spawn(|| publish(&hub, &is_over));
         scope.spawn(|| deliver(&hub, &is_over));
-        let mut browser =
-            Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, NO_DRAWING);
+        let mut browser = Browser::open_with(&program, &server.url(), WINDOW_PX, NO_DRAWING);
         wait_for(&mut browser, "a full picture", |browser| {
             browser.text("picture-text").contains("100 %")
         });
@@ -130,7 +126,6 @@ fn tasks_of_the_main_thread_are_short() {
         is_over.store(true, Ordering::Relaxed);
         tasks
     });
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
     let mut tasks: Vec<f64> = tasks.iter().map(|task| task.cpu_millis).collect();
     tasks.sort_by(f64::total_cmp);
     let percentile = |share: usize| tasks[(tasks.len() - 1) * share / 1000];

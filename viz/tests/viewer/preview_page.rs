@@ -5,7 +5,6 @@
 
 use crate::robot;
 use kinematics::{Stamp, Transform};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -152,9 +151,7 @@ fn a_preview_shows_images_the_robot_and_devices_but_no_model() {
     let listen = ([127, 0, 0, 1], 0).into();
     let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
     let devices = Devices::start(&hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-preview-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
 
     wait_for(&mut browser, "the state of each device", |browser| {
         let text = browser.text("devices-card");
@@ -241,5 +238,4 @@ fn a_preview_shows_images_the_robot_and_devices_but_no_model() {
     });
     drop(devices);
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

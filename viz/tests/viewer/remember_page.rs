@@ -9,7 +9,6 @@ use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::Translation3;
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use test_support::browser::{Browser, browser_for_page, canvas_shot, wait_for};
 use trainer::{Projection, RenderRequest};
@@ -64,9 +63,7 @@ fn page_finds_its_view_again() {
         let picture = draw(&pending.request);
         pending.deliver(picture);
     });
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-remember-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     let first = full_view(&mut browser, &requests);
     assert_eq!(
         browser.evaluate("location.hash"),
@@ -88,7 +85,6 @@ fn page_finds_its_view_again() {
     check_time(&mut browser, &requests);
     drop(browser);
     drop(renderer);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Keyframes of one camera that moves along x. Each photograph has one gray level.

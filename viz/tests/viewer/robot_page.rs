@@ -126,8 +126,7 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
     let server = serve(&hub);
     let run = Run::start(&hub);
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-robot-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     wait_for(&mut browser, "a picture", |browser| {
         browser.text("picture-text").contains("100 %")
     });
@@ -193,7 +192,6 @@ fn robot_silhouette_is_exact_in_front_and_behind() {
         browser.evaluate("document.getElementById('robot-age').hidden") == true
     });
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// A double click rotates the view toward the surface at that pixel.

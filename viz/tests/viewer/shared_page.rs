@@ -21,18 +21,9 @@ const CENTER_M: [f64; 3] = [0.5, 0.0, 0.1];
 /// A page that is not blocked connects much faster, even on two busy cores.
 const BLOCKED_AFTER: Duration = Duration::from_secs(5);
 
-/// Chromium and an empty folder for its profile, if the test can run.
-fn chromium_and_profile(name: &str) -> Option<(PathBuf, PathBuf)> {
-    let program = browser_for_page()?;
-    Some((
-        program,
-        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id())),
-    ))
-}
-
 #[test]
 fn page_uses_its_token_and_shows_its_role() {
-    let Some((program, profile)) = chromium_and_profile("shared") else {
+    let Some(program) = browser_for_page() else {
         return;
     };
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
@@ -68,7 +59,7 @@ fn page_uses_its_token_and_shows_its_role() {
     .expect("a free port");
 
     // The sentence of the server is shown although browsers hide why a WebSocket was refused.
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
     let has_banner =
         |text: &'static str| move |browser: &mut Browser| browser.text("banner").contains(text);
     wait_for(
@@ -172,7 +163,6 @@ fn page_uses_its_token_and_shows_its_role() {
     });
     wait_for(&mut browser, "a connection", connected);
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 fn press(browser: &mut Browser, key: &str) {
@@ -266,7 +256,7 @@ fn serve_html(html: String) -> String {
 
 #[test]
 fn other_sites_can_neither_embed_nor_use_the_page() {
-    let Some((program, profile)) = chromium_and_profile("foreign") else {
+    let Some(program) = browser_for_page() else {
         return;
     };
     let hub = Hub::new();
@@ -282,7 +272,7 @@ fn other_sites_can_neither_embed_nor_use_the_page() {
          socket.onopen = show('open'); socket.onerror = show('refused');</script>",
         server.url()
     );
-    let mut browser = Browser::open(&program, &profile, &serve_html(html), WINDOW_PX);
+    let mut browser = Browser::open(&program, &serve_html(html), WINDOW_PX);
     wait_for(&mut browser, "the socket", |browser| {
         ["open", "refused"].contains(&&*browser.text("socket"))
     });
@@ -296,5 +286,4 @@ fn other_sites_can_neither_embed_nor_use_the_page() {
     browser.call("Page.navigate", json!({"url": server.url()}));
     wait_for(&mut browser, "a client", |_| hub.n_clients() == 1);
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

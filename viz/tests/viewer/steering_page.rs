@@ -343,10 +343,8 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
         listen: ([127, 0, 0, 1], 0).into(),
     };
     let server = Server::start(config, hub.clone()).expect("a free port");
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-steering-{}", std::process::id()));
     let mut page = Page {
-        browser: Browser::open(&program, &profile, &server.url(), WINDOW_PX),
+        browser: Browser::open(&program, &server.url(), WINDOW_PX),
         last,
     };
     page.shown_view(|_| true);
@@ -388,7 +386,6 @@ fn operators_steer_with_a_held_switch_and_preview_over_long_links() {
     publish_steering(&hub, None);
     page.wait_until_visible("toggle-steer", false);
     drop((page, far, thread, server));
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Taking control moves nothing, and shows the stop button.
@@ -729,10 +726,8 @@ fn viewers_watch_and_stop() {
         tokens,
     };
     let server = Server::start_shared(config, sharing, hub).expect("a free port");
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-steering-viewer-{}", std::process::id()));
     let mut page = Page {
-        browser: Browser::open(&program, &profile, &server.url(), WINDOW_PX),
+        browser: Browser::open(&program, &server.url(), WINDOW_PX),
         last,
     };
     page.wait_for_text("banner", "This server requires a token");
@@ -761,5 +756,4 @@ fn viewers_watch_and_stop() {
     );
     assert!(arm.script.lock().commands.is_empty());
     drop((page, arm, thread, server));
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

@@ -77,9 +77,7 @@ fn page_works_with_an_older_server_or_says_why_not() {
     let Some(program) = browser_for_page() else {
         return;
     };
-    let profile =
-        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("older-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &serve(vec![hello(2)]), WINDOW_PX);
+    let mut browser = Browser::open(&program, &serve(vec![hello(2)]), WINDOW_PX);
     wait_for(&mut browser, "the reason", |browser| {
         browser
             .text("banner")
@@ -105,7 +103,6 @@ fn page_works_with_an_older_server_or_says_why_not() {
         "the server has no controls"
     );
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Browsers without hardware acceleration, as in some remote desktops, have no WebGL 2.
@@ -115,15 +112,7 @@ fn page_without_webgl_shows_an_error() {
     let Some(program) = browser_for_page() else {
         return;
     };
-    let profile =
-        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("no-webgl-{}", std::process::id()));
-    let mut browser = Browser::open_with(
-        &program,
-        &profile,
-        &serve(vec![hello(3)]),
-        WINDOW_PX,
-        NO_WEBGL,
-    );
+    let mut browser = Browser::open_with(&program, &serve(vec![hello(3)]), WINDOW_PX, NO_WEBGL);
     wait_for(&mut browser, "the reason", |browser| {
         browser
             .text("banner")
@@ -131,5 +120,4 @@ fn page_without_webgl_shows_an_error() {
     });
     assert_eq!(browser.text("connection"), "not connected");
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }

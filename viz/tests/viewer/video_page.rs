@@ -7,7 +7,6 @@ use crate::request_thread::RequestThread;
 use analytic_scene::{draw, looking_along_y};
 use nalgebra::Vector3;
 use serde_json::json;
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::RenderRequest;
@@ -106,10 +105,8 @@ fn a_recorded_video_has_every_frame() {
     });
     let server = serve(&hub);
     let renderer = Renderer::start(hub);
-    let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-        .join(format!("chromium-video-{}", std::process::id()));
     let script = format!("{NO_DRAWING}{KEEP_FILE}");
-    let mut browser = Browser::open_with(&program, &profile, &server.url(), WINDOW_PX, &script);
+    let mut browser = Browser::open_with(&program, &server.url(), WINDOW_PX, &script);
     // The page may not play videos, but this test does.
     browser.call("Page.setBypassCSP", json!({"enabled": true}));
     browser.evaluate("window.isOld = true");
@@ -175,7 +172,6 @@ fn a_recorded_video_has_every_frame() {
     );
     drop(browser);
     drop(renderer);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// The frame of the video shows the picture of the request.

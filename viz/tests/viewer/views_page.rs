@@ -11,7 +11,6 @@ use analytic_scene::looking_along_y;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use serde_json::json;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -235,9 +234,7 @@ fn views_follow_the_scene_and_the_robot() {
     hub.set_robot(robot::description());
     let server = serve(&hub);
     let run = Run::start(&hub);
-    let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-views-{}", std::process::id()));
-    let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
+    let mut browser = Browser::open(&program, &server.url(), WINDOW_PX);
 
     check_first_view(&mut browser, &run, &hub);
     check_axes(&mut browser, &run);
@@ -247,7 +244,6 @@ fn views_follow_the_scene_and_the_robot() {
 
     drop(browser);
     drop(run);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// The first view shows everything from behind the robot, and follows the growing scene until the
@@ -574,7 +570,7 @@ fn check_near_links(browser: &mut Browser, run: &Run, hub: &Hub) {
 /// The wheel stops at a wall behind the eye; the page says so, and can cut the wall away.
 #[test]
 fn a_wall_that_stops_the_eye_can_be_cut_away() {
-    let Some(mut page) = eye_page::Page::open("cut", true, 2.0) else {
+    let Some(mut page) = eye_page::Page::open(true, 2.0) else {
         return;
     };
     wait_for(
@@ -628,7 +624,7 @@ fn a_wall_that_stops_the_eye_can_be_cut_away() {
 /// whole room.
 #[test]
 fn the_overview_cuts_away_what_hides_the_robot() {
-    let Some(mut page) = eye_page::Page::open("hidden-robot", true, 2.0) else {
+    let Some(mut page) = eye_page::Page::open(true, 2.0) else {
         return;
     };
     page.hub.set_robot(robot::description());
