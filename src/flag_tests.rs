@@ -14,7 +14,7 @@ use syn::{Attribute, Item, LitStr, Macro, Meta};
 /// Source files or folders, and the commands that print their messages. If a message contains a
 /// flag or setting, all these commands must accept it. The exception is a message that names a
 /// command that accepts the flag.
-const PRINTED_BY: [(&str, &[&str]); 44] = [
+const PRINTED_BY: [(&str, &[&str]); 45] = [
     ("bench/src", &["bench"]),
     (
         "calibration/procedures/src/hand_eye",
@@ -78,6 +78,16 @@ const PRINTED_BY: [(&str, &[&str]); 44] = [
     (
         "session/src/training_options.rs",
         &["run", "train", "bench"],
+    ),
+    (
+        "src/app_window.rs",
+        &[
+            "run",
+            "view",
+            "preview",
+            "calibrate intrinsics",
+            "calibrate hand-eye",
+        ],
     ),
     ("src/commands/bench", &["bench"]),
     ("src/commands/calibrate", &["calibrate"]),

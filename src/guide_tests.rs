@@ -7,14 +7,15 @@ use clap::{CommandFactory, Parser};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Flags of other programs that the prose names: cargo, curl, pkg-config, converters and senders.
-const OF_OTHER_PROGRAMS: [&str; 8] = [
+/// Flags of other programs that the prose names: cargo, curl, pkg-config, browsers, converters and senders.
+const OF_OTHER_PROGRAMS: [&str; 9] = [
     "cacert",
     "calibration",
     "camera-in-body",
     "features",
     "insecure",
     "modversion",
+    "no-sandbox",
     "release",
     "topic",
 ];

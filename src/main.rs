@@ -1,6 +1,7 @@
 //! The `fieldrig` command: parse, run, exit code.
 
 mod allocator;
+mod app_window;
 mod checkpoint_args;
 mod cli;
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Flags for the address of the page, and who may open it.
 
+use crate::app_window::AppWindow;
 use crate::{print, user_folders};
 use anyhow::Context;
 use messages::{BadInput, quoted_for_shell};
@@ -8,8 +9,8 @@ use qrcode::render::unicode::Dense1x2;
 use serde_json::Value;
 use std::io::IsTerminal;
 use std::net::{Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
-use viz::{CertificateSource, Hub, PageOptions, ServedPage};
+use std::path::{Path, PathBuf};
+use viz::{CertificateSource, Hub, PageOptions, ServedPage, Workspace};
 
 /// Where the page is served, and to whom.
 #[derive(Clone, Debug, clap::Args)]
@@ -33,6 +34,10 @@ pub(crate) struct PageArgs {
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, require_equals = true,
         default_missing_value = "127.0.0.1:8765", value_parser = address)]
     foxglove: Option<SocketAddr>,
+    /// Also open the page in a window of an installed Chromium-based browser, without address bar
+    /// and tabs. Closing the window does not end the command
+    #[arg(long)]
+    app: bool,
 }
 
 /// Parses the address of the page. Other names than localhost are not resolved, because a name may
@@ -53,11 +58,11 @@ fn address(text: &str) -> Result<SocketAddr, String> {
 impl PageArgs {
     /// Whether any of the flags is given.
     pub(crate) fn is_given(&self) -> bool {
-        self.listen.is_some() || self.share || self.foxglove.is_some()
+        self.listen.is_some() || self.share || self.foxglove.is_some() || self.app
     }
 
-    /// Rejects an address that other machines can reach, unless the page is shared, and flags that
-    /// this build lacks.
+    /// Rejects an address that other machines can reach, unless the page is shared, flags that this
+    /// build lacks, and a window that cannot be opened.
     pub(crate) fn check(&self) -> Result<(), BadInput> {
         if let Some(address) = self.listen
             && !address.ip().is_loopback()
@@ -75,7 +80,37 @@ impl PageArgs {
             )));
         }
         let options = self.options()?;
-        options.check().map_err(|error| BadInput(error.to_string()))
+        options
+            .check()
+            .map_err(|error| BadInput(error.to_string()))?;
+        self.window().map(|_| ())
+    }
+
+    /// The window to open, if one is wanted.
+    fn window(&self) -> Result<Option<AppWindow>, BadInput> {
+        self.app
+            .then(|| AppWindow::find(&data_folder()?))
+            .transpose()
+    }
+
+    /// Prints the addresses of a page, and opens its window if one is wanted. If `is_json` is set,
+    /// prints them as an event that also has these fields.
+    pub(crate) fn announce(
+        &self,
+        page: &ServedPage,
+        is_json: bool,
+        fields: Value,
+    ) -> anyhow::Result<()> {
+        print_page(page, is_json, fields)?;
+        self.open_window(page)
+    }
+
+    /// Opens the window of a page if one is wanted.
+    pub(crate) fn open_window(&self, page: &ServedPage) -> anyhow::Result<()> {
+        match self.window()? {
+            Some(window) => window.open(&page.url()),
+            None => Ok(()),
+        }
     }
 
     /// Serves the page.
@@ -106,9 +141,16 @@ impl PageArgs {
     }
 }
 
+/// Reads the workspace with which the page starts, if there is one.
+pub(crate) fn workspace_at(path: Option<&Path>) -> Result<Option<Workspace>, BadInput> {
+    path.map(Workspace::read)
+        .transpose()
+        .map_err(|error| BadInput(error.to_string()))
+}
+
 /// Prints the addresses of a page. If `is_json` is set, prints them as an event that also has these
 /// fields.
-pub(crate) fn print_page(page: &ServedPage, is_json: bool, fields: Value) -> anyhow::Result<()> {
+fn print_page(page: &ServedPage, is_json: bool, fields: Value) -> anyhow::Result<()> {
     if is_json {
         let mut event = page.event();
         if let (Value::Object(event), Value::Object(fields)) = (&mut event, fields) {
@@ -139,7 +181,7 @@ fn qr_code(text: &str) -> anyhow::Result<String> {
 fn data_folder() -> Result<PathBuf, BadInput> {
     user_folders::data().ok_or_else(|| {
         BadInput(
-            "there is no home folder for the TLS certificate: set HOME, or use --certificate"
+            "there is no home folder for the TLS certificate and the profile of the window: set HOME"
                 .to_owned(),
         )
     })

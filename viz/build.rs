@@ -7,13 +7,15 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Files written by `scripts/build-web.sh`.
-const BUNDLE: [&str; 8] = [
+const BUNDLE: [&str; 10] = [
     "web/dist/index.html",
     "web/dist/app.js",
     "web/dist/splat_worker.js",
     "web/dist/video_worker.js",
     "web/dist/mesh_loaders.js",
     "web/dist/coverage.js",
+    "web/dist/study_page.js",
+    "web/dist/workspace_page.js",
     "web/dist/steering.js",
     "web/dist/app.css",
 ];

@@ -1,7 +1,7 @@
 //! `fieldrig preview`: shows live images, the moving robot and the devices of a rig.
 
 use crate::exit::Exit;
-use crate::page_args::{PageArgs, print_page};
+use crate::page_args::PageArgs;
 use crate::signals;
 use serde_json::json;
 use session::Preview;
@@ -40,7 +40,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = signals::stop_on_signals_logging("closing the devices; Ctrl-C again exits at once")?;
     let preview = Preview::of_rig_file(&args.rig_file, args.sim)?;
     let page = args.page.serve_or_free_port(preview.hub())?;
-    print_page(&page, args.json, json!({}))?;
+    args.page.announce(&page, args.json, json!({}))?;
     preview.serve(&stop)?;
     Ok(Exit::Done)
 }

@@ -5,7 +5,7 @@ use crate::console::{Console, OutputMode, print_end, print_finished_run};
 use crate::exit::{self, Exit};
 use crate::number_args::number_in_range;
 use crate::open_gpu::open_gpu;
-use crate::page_args::{PageArgs, print_page};
+use crate::page_args::{PageArgs, workspace_at};
 use crate::permission_args::PermissionArgs;
 use crate::training_args::{TRAINING_ARGS, TrainingArgs};
 use crate::{print, signals};
@@ -72,6 +72,10 @@ pub(crate) struct Args {
     training: TrainingArgs,
     #[command(flatten)]
     page: PageArgs,
+    /// Start the page with this workspace, which the page has saved: camera, layers, crop box,
+    /// panels and model. Not restored by --resume
+    #[arg(long, value_name = "FILE")]
+    workspace: Option<PathBuf>,
     /// Folder for the results and the effective rig file. With several methods, each method gets a
     /// subfolder. A folder that contains a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
@@ -160,6 +164,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// Opens the devices, the GPU and the page; continues the `previous` run if there is one.
 pub(super) fn start(args: &Args, previous: Option<PreviousLiveRun>) -> anyhow::Result<Running> {
     args.page.check()?;
+    let workspace = workspace_at(args.workspace.as_deref())?;
     // Signals are handled before the rig is read, so that Ctrl-C during a long start also ends the
     // run in an orderly way.
     let stop = signals::stop_on_signals()?;
@@ -172,11 +177,15 @@ pub(super) fn start(args: &Args, previous: Option<PreviousLiveRun>) -> anyhow::R
         },
     };
     let prepared = args.plan().prepare(previous, services)?;
+    if let Some(workspace) = workspace {
+        prepared.hub().set_workspace(workspace);
+    }
     // The page is served before kernels are compiled. If its address is in use, this is reported at
     // once, and viewers can connect while kernels are compiled.
     let page = args.page.serve(prepared.hub())?;
     let opened = prepared.open_devices()?;
-    print_page(&page, args.json, serde_json::json!({}))?;
+    args.page
+        .announce(&page, args.json, serde_json::json!({}))?;
     let run = opened.start()?;
     Ok(Running { run, page, stop })
 }

@@ -2,7 +2,7 @@
 
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
-use crate::page_args::{PageArgs, print_page};
+use crate::page_args::{PageArgs, workspace_at};
 use crate::signals;
 use nalgebra::Vector3;
 use serde_json::json;
@@ -22,6 +22,10 @@ pub(crate) struct Args {
     /// -y up
     #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
     up: Up,
+    /// Start the page with this workspace, which the page has saved: camera, layers, crop box,
+    /// panels and model
+    #[arg(long, value_name = "FILE")]
+    workspace: Option<PathBuf>,
     /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
@@ -47,11 +51,15 @@ fn up_axis(text: &str) -> Result<Up, String> {
 /// Serves the page until Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.page.check()?;
+    let workspace = workspace_at(args.workspace.as_deref())?;
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
     let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
+    if let Some(workspace) = workspace {
+        hub.set_workspace(workspace);
+    }
     // The server starts before the models are loaded, so that an address in use is reported at
     // once.
     let page = args.page.serve_or_free_port(&hub)?;
@@ -59,7 +67,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let model_from_page = model_from_page(&args.up.0);
     let models = load_saved(&hub, &gpu, paths, &model_from_page)?;
     let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
-    print_page(&page, args.json, json!({ "methods": methods }))?;
+    args.page
+        .announce(&page, args.json, json!({ "methods": methods }))?;
     ModelViewer::new(models, hub)
         .with_model_from_page(model_from_page)
         .serve(&stop);

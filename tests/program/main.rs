@@ -1,6 +1,7 @@
 //! Tests of the whole program `fieldrig` in one program, so that they are linked once and fill all
 //! processors.
 
+mod app_window;
 mod arrows;
 mod bench;
 mod bring_up;

@@ -62,6 +62,8 @@ fn send_file(mut stream: TcpStream, head: &str) {
         "/splat_worker.js" => ("splat_worker.js", "text/javascript"),
         "/mesh_loaders.js" => ("mesh_loaders.js", "text/javascript"),
         "/coverage.js" => ("coverage.js", "text/javascript"),
+        "/study_page.js" => ("study_page.js", "text/javascript"),
+        "/workspace_page.js" => ("workspace_page.js", "text/javascript"),
         "/steering.js" => ("steering.js", "text/javascript"),
         "/app.css" => ("app.css", "text/css"),
         _ => ("", "text/plain"),

@@ -48,6 +48,14 @@ pub enum Error {
         /// Error of the operating system.
         source: std::io::Error,
     },
+    /// A file is no workspace.
+    #[error("{} is no workspace that this version can open: {reason}", file.display())]
+    Workspace {
+        /// File that was read.
+        file: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// There are no random numbers for the tokens of a shared page.
     #[error("cannot create a token")]
     Token {

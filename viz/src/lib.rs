@@ -26,6 +26,7 @@ mod pose;
 mod server;
 mod steering;
 mod topics;
+mod workspace;
 
 pub use client::keyframe_image::ReadKeyframe;
 pub use client::protocol::{BASE_PROTOCOL_VERSION, Control, PROTOCOL_VERSION};
@@ -68,6 +69,7 @@ pub use topics::published_data::{
     SceneHint, SourceKind, StateProgress, Status, Verdict,
 };
 pub use topics::robot_description::{MeshFormat, RobotDescription, RobotMesh};
+pub use workspace::Workspace;
 
 /// Handles the messages of a client, one per line, and panics if a result is inconsistent.
 #[cfg(fuzzing)]

@@ -55,6 +55,8 @@ await build({
   entryPoints: {
     mesh_loaders: join(here, "src/layers/mesh_loaders.ts"),
     coverage: join(here, "src/panels/coverage.ts"),
+    study_page: join(here, "src/study/study_page.ts"),
+    workspace_page: join(here, "src/workspace/workspace_page.ts"),
   },
   format: "esm",
   plugins: [withoutRenderer],

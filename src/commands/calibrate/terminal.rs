@@ -77,6 +77,7 @@ impl Host for Terminal<'_> {
         // The address is printed to stderr, because stdout contains only the result.
         print::notice("the page shows camera images and what to do next:");
         server.lines().iter().for_each(print::notice);
+        page.open_window(&server)?;
         Ok(Box::new(TerminalView {
             bar,
             page: GuidancePage::new(hub, camera),

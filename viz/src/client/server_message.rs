@@ -26,6 +26,8 @@ pub(crate) enum ServerMessage<'a> {
         max_size_px: [u32; 2],
         default_stages: &'a [f64],
         clock_millis: f64,
+        /// Whether the server has a workspace with which pages start.
+        has_workspace: bool,
     },
     /// Reply to the client's hello: the version and the capabilities that the connection uses from
     /// now on.

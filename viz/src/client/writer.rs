@@ -375,6 +375,7 @@ impl Writer<'_> {
             max_size_px: [MAX_SIZE_PX; 2],
             default_stages: &DEFAULT_STAGES,
             clock_millis: self.server_context.clock.now_millis(),
+            has_workspace: self.server_context.hub.workspace().is_some(),
         };
         self.send_message(&hello).await
     }

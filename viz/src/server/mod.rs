@@ -421,6 +421,7 @@ struct AppState {
 fn router(app_state: AppState) -> Router {
     let mut router = Router::new()
         .route("/status", get(status))
+        .route("/workspace", get(workspace))
         .route("/robot/{mesh}", get(robot_mesh))
         .route("/files/{name}", get(file))
         .route("/ws", get(connect))
@@ -460,6 +461,20 @@ async fn status(State(app_state): State<AppState>) -> Response {
             (headers, json).into_response()
         }
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    }
+}
+
+/// The workspace with which pages start.
+async fn workspace(State(app_state): State<AppState>) -> Response {
+    match app_state.server_context.hub.workspace() {
+        Some(workspace) => {
+            let headers = [
+                (header::CONTENT_TYPE, "application/json"),
+                (header::CACHE_CONTROL, "no-store"),
+            ];
+            (headers, workspace.text().to_owned()).into_response()
+        }
+        None => (StatusCode::NOT_FOUND, "the server has no workspace").into_response(),
     }
 }
 

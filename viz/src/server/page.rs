@@ -64,6 +64,18 @@ pub(crate) const FILES: &[PageFile] = &[
         "coverage.js"
     ),
     page_file!(
+        "/study_page.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "study_page.js"
+    ),
+    page_file!(
+        "/workspace_page.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "workspace_page.js"
+    ),
+    page_file!(
         "/steering.js",
         "text/javascript; charset=utf-8",
         "../../web/dist/",

@@ -20,6 +20,7 @@ use viz::{
 };
 
 const WINDOW_PX: [u32; 2] = [1280, 900];
+const PHONE_PX: [u32; 2] = [390, 844];
 const SIZE_PX: [u32; 2] = [320, 240];
 const FOCAL_PX: f64 = 280.0;
 const RADIUS_M: f64 = 0.8;
@@ -240,6 +241,8 @@ fn the_keyframe_browser_says_what_is_wrong_with_each_keyframe() {
     check_order(&mut browser);
     check_look(&mut browser, &requests);
     check_click(&mut browser, &requests);
+    check_newest(&mut browser);
+    check_live(&mut browser, &hub, &scratch);
     check_missing_photograph(&mut browser, &hub);
     check_coverage(&mut browser, &hub, &requests);
     check_saved_picture(&mut browser);
@@ -289,7 +292,7 @@ fn go_to_first(browser: &mut Browser) {
 }
 
 fn check_faults(browser: &mut Browser, scratch: &Path) {
-    assert_eq!(browser.text("look-nearest"), "Keyframes");
+    assert_eq!(browser.text("look-nearest"), "Compare");
     browser.evaluate(
         "void document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'n', bubbles: true}))",
     );
@@ -467,6 +470,116 @@ fn pixel_of(request: &RenderRequest, point: &Point3<f64>) -> [f64; 2] {
     [0, 1].map(|axis| focal_px[axis] * in_camera[axis] / in_camera.z + principal_px[axis])
 }
 
+/// Chooses what is compared with the model.
+fn choose_source(browser: &mut Browser, value: &str) {
+    browser.evaluate(&format!(
+        "(() => {{ const source = document.getElementById('compare-source'); source.value = '{value}'; \
+         source.dispatchEvent(new Event('change')); }})()"
+    ));
+}
+
+/// Whether the buttons for other keyframes are shown.
+fn can_step(browser: &mut Browser) -> bool {
+    browser.evaluate("document.getElementById('keyframe-next').hidden") == false
+}
+
+fn check_newest(browser: &mut Browser) {
+    assert!(can_step(browser));
+    choose_source(browser, "newest");
+    wait_for(browser, "the newest keyframe", |browser| {
+        browser.text("keyframe-title") == "Newest keyframe"
+            && browser.text("keyframe-faults").contains(CASES[4].fault)
+    });
+    assert!(!can_step(browser), "there is only one");
+}
+
+/// Shows a live image from the pose of a keyframe.
+fn show_live(hub: &Hub, secs: i64, change: fn(&mut [u8])) {
+    let pose = corrected_pose(CASES[2].x_m);
+    let mut rgba_srgb = draw(&request_from(pose)).rgba_srgb;
+    change(&mut rgba_srgb);
+    hub.set_live_image(LiveImage {
+        camera: "wrist".into(),
+        stamp: Stamp(secs * SECOND),
+        captured_at: Instant::now(),
+        size_px: SIZE_PX,
+        pixels: LivePixels::Rgba(rgba_srgb.into()),
+        world_from_camera: Some(pose),
+        focal_px: [FOCAL_PX; 2],
+        principal_px: SIZE_PX.map(|side| 0.5 * f64::from(side)),
+    });
+}
+
+/// The live image is compared with the model from its pose, and each further image again. The panel
+/// fits a phone.
+fn check_live(browser: &mut Browser, hub: &Hub, scratch: &Path) {
+    /// A picture of the scene itself, of which two encodings as JPEG differ.
+    const MIN_PSNR: f64 = 25.0;
+    let psnr = |browser: &mut Browser| {
+        let text = fact(browser, "PSNR");
+        text.trim_end_matches(" dB").parse::<f64>().unwrap_or(0.0)
+    };
+    show_live(hub, 242, add_object);
+    wait_for(browser, "the camera in the list", |browser| {
+        browser.evaluate("[...document.getElementById('compare-source').options].some(({value}) => value === 'live:wrist')") == true
+    });
+    choose_source(browser, "live:wrist");
+    let stamp =
+        |expected: &'static str| move |browser: &mut Browser| fact(browser, "Stamp") == expected;
+    // The image may be sent again at the size of the comparison only when the next one arrives.
+    show_live(hub, 243, add_object);
+    wait_for(browser, "the live image", stamp("243.000 s"));
+    assert_eq!(browser.text("keyframe-title"), "Live image of wrist");
+    assert!(!can_step(browser));
+    assert!(
+        browser
+            .text("keyframe-faults")
+            .contains("large error in the upper left")
+    );
+    let with_object = psnr(browser);
+    assert!((5.0..MIN_PSNR).contains(&with_object), "{with_object}");
+    let on_object = [MOVED_PX[0] + 20, MOVED_PX[1] + 20];
+    let beside = [MOVED_PX[2] + 40, MOVED_PX[3] + 60];
+    let [on_object, beside] =
+        [on_object, beside].map(|at| brightness(browser, "keyframe-error", at));
+    assert!(on_object > beside + 200.0, "{on_object}, {beside}");
+
+    show_live(hub, 244, |_| {});
+    wait_for(browser, "the next live image", stamp("244.000 s"));
+    assert!(psnr(browser) > MIN_PSNR, "{}", psnr(browser));
+    assert!(
+        browser
+            .text("keyframe-faults")
+            .contains("the image and the model agree")
+    );
+
+    std::fs::write(scratch.join("page-compare-live.png"), browser.screenshot()).expect("written");
+    browser.resize(PHONE_PX);
+    browser.next_frame();
+    let bounds = browser.evaluate(
+        "(() => { const b = document.getElementById('keyframe-browser').getBoundingClientRect(); \
+         return [b.left, b.top, innerWidth - b.right, innerHeight - b.bottom]; })()",
+    );
+    let margins: Vec<f64> = bounds
+        .as_array()
+        .expect("a list")
+        .iter()
+        .filter_map(Value::as_f64)
+        .collect();
+    assert!(
+        margins.len() == 4 && margins.iter().all(|margin| *margin >= 0.0),
+        "{margins:?}"
+    );
+    std::fs::write(scratch.join("page-compare-phone.png"), browser.screenshot()).expect("written");
+    browser.resize(WINDOW_PX);
+    choose_source(browser, "stored");
+    wait_for(browser, "stored keyframes", can_step);
+    for _ in 0..CASES.len() {
+        press(browser, "ArrowRight");
+    }
+    wait_for_keyframe(browser, CASES.len());
+}
+
 /// Keyframes whose photographs are not stored are shown with the model only.
 fn check_missing_photograph(browser: &mut Browser, hub: &Hub) {
     hub.keyframes().set_sources([]);
@@ -520,7 +633,7 @@ fn check_coverage(browser: &mut Browser, hub: &Hub, requests: &Mutex<Vec<RenderR
     let camera = Translation3::new(0.05, 1.05, 0.0) * looking_along_y();
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
-        stamp: Stamp(241 * SECOND),
+        stamp: Stamp(245 * SECOND),
         captured_at: Instant::now(),
         size_px: SIZE_PX,
         pixels: LivePixels::Rgba(draw(&request_from(camera)).rgba_srgb.into()),

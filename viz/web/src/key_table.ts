@@ -33,6 +33,8 @@ export const KEYS: Readonly<Record<string, string>> = {
   "toggle-frames": "h",
   "toggle-images": "i",
   "toggle-occlude": "o",
+  "save-workspace": "Ctrl+S",
+  "open-workspace": "Ctrl+O",
   "steer-stop": "Space",
   "steer-keys": "w",
   "erase-box": "Delete",

@@ -40,6 +40,7 @@ import { RobotAge } from "./panels/robot_age";
 import { CONTROLLABLE, RunControls } from "./panels/run_controls";
 import { RunEnd } from "./panels/run_end";
 import { ShownModel } from "./panels/shown_model";
+import { reasonOf } from "./panels/sentence";
 import { setUpSidePanel } from "./panels/side_panel";
 import { Skeleton } from "./panels/skeleton";
 import { TimePhoto } from "./panels/time_photo";
@@ -66,6 +67,7 @@ import { setUpSavePicture } from "./view/save_picture";
 import { ViewControls } from "./view/view_controls";
 import { ViewMemory } from "./view/view_memory";
 import { ViewSettings } from "./view/view_settings";
+import { WorkspaceFiles } from "./workspace/workspace_files";
 
 let stages = [0.1, 0.5, 1];
 let sceneRadiusM = 1;
@@ -174,7 +176,7 @@ const browser = new KeyframeBrowser({
   view,
   topic: keyframes,
   common: () => scheduler.picture({ ...view.view(), crop: undefined }),
-  live: () => liveImages.latest,
+  liveImages,
   radiusM: () => sceneRadiusM,
 });
 const model = new ShownModel({ view, models, readouts, edits, scheduler, browser, surroundings, topics, chunks });
@@ -237,6 +239,9 @@ new Tooltip();
 // After all toggles have their listeners, because restoring a view presses them.
 const memory = new ViewMemory(view, settings, models);
 const namedViews = new NamedViews(memory);
+const workspaces = new WorkspaceFiles({ memory, view, images, identity: () => model.status?.identity, say: showToast });
+
+if (new URLSearchParams(location.search).has("study")) void openStudy();
 
 /** Called when a new connection is open. The server may be another one, and does not know earlier requests. */
 function restart(): void {
@@ -259,6 +264,16 @@ const newRun = new NewRun((sentence) => {
   view.changed();
   showToast(sentence);
 });
+
+async function openStudy(): Promise<void> {
+  try {
+    const { StudyPage } = await import("./study/study_page");
+    const methods = (): string[] => (model.status ? [model.status, ...model.status.others].map(({ method }) => method) : []);
+    new StudyPage(document.querySelector(".tools")!, { memory, resetView: () => view.reset(), methods, say: showToast });
+  } catch (error) {
+    showToast(`The study cannot be loaded: ${reasonOf(error)}`);
+  }
+}
 
 function receiveStatus(status: Status): void {
   newRun.show(status);
@@ -287,6 +302,7 @@ function receiveText(message: TextMessage): void {
       header.client = message.client;
       edits.client = message.client;
       showRole(message.role);
+      workspaces.serverHasOne(message.has_workspace ?? false);
       break;
     case "scene":
       sceneRadiusM = message.radius_m;

@@ -26,7 +26,7 @@ test("all keyframes are measured once, also if some of them fail", async (contex
     asked.push(next.id);
     const hasFailed = next.id === 2;
     const errors = hasFailed ? null : { psnr: 20 + next.id };
-    return Promise.resolve({ keyframe: next, photo: "", render: hasFailed ? "busy" : {}, errors } as Comparison);
+    return Promise.resolve({ photo: "", render: hasFailed ? "busy" : {}, newestMillis: null, errors } as Comparison);
   };
   const survey = new KeyframeSurvey({ compare }, () => all, () => undefined);
   await settle(context);

@@ -45,6 +45,8 @@ export interface Hello {
   max_size_px: [number, number];
   default_stages: number[];
   clock_millis: number;
+  /** Whether the server has a workspace with which pages start; older servers have none. */
+  has_workspace?: boolean;
 }
 
 /** Reply to the page's hello. */

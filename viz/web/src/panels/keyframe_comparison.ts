@@ -1,7 +1,7 @@
-// Gets the photograph of a keyframe and the model's picture of the same view, and compares them.
+// Gets a camera image, of a keyframe or live, and the model's picture from the same pose, and compares them.
 
 import type { KeyframePhotos, Photo } from "../connection/keyframe_photos";
-import type { KeyframeImageHeader, NumberedKeyframe } from "../connection/protocol";
+import type { KeyframeImageHeader, LiveImageHeader, NumberedKeyframe, PosedCamera } from "../connection/protocol";
 import type { PictureRequest, SidePicture, SideView } from "../layers/side_view";
 import { decodeDepth } from "../layers/depth_part";
 import { decodeJpeg } from "../layers/jpeg";
@@ -15,17 +15,19 @@ import { reasonOf } from "./sentence";
  * It is null if all pixels are used.
  */
 export interface DecodedPhoto {
-  header: KeyframeImageHeader;
+  /** Null for live images. */
+  header: KeyframeImageHeader | null;
   image: ImageData;
   mask: Uint8Array | null;
 }
 
 export interface Comparison {
-  keyframe: NumberedKeyframe;
   /** The photograph, or the reason why there is none. */
   photo: DecodedPhoto | string;
   /** The model's picture, or the reason why there is none. */
   render: ImageData | string;
+  /** Time at which the newest keyframe of the model was taken, on the server's clock; null if unknown. */
+  newestMillis: number | null;
   /** Null if one of the two is missing. */
   errors: KeyframeErrors | null;
 }
@@ -36,14 +38,70 @@ export type CommonRequest = Omit<PictureRequest, "world_from_camera" | "size_px"
 /** Maximum time to wait for a picture. If it takes longer, the server is busy, for example with saving. */
 const TIMEOUT_MILLIS = 30_000;
 
+/** A live image with its pose. */
+export interface PosedImage {
+  header: LiveImageHeader & PosedCamera;
+  jpeg: Uint8Array<ArrayBuffer>;
+}
+
+/** The model's picture, and which of its pixels show a surface; null if that is unknown. */
+interface Render {
+  image: ImageData;
+  surface: Uint8Array | null;
+  newestMillis: number | null;
+}
+
+/** Gets pictures of the model from the poses of cameras. */
+export class PoseRenderer {
+  constructor(
+    private readonly side: SideView,
+    private readonly common: () => CommonRequest,
+  ) {}
+
+  /** Ends the pending request, because its picture is not worth waiting for. */
+  abandon(reason: string): void {
+    this.side.abandon(reason);
+  }
+
+  /** The model from the pose of a camera, at this size, or the reason why there is no picture. */
+  async render(camera: PosedCamera, [width, height]: [number, number]): Promise<Render | string> {
+    if (!this.side.isPossible) return "the server draws no other views";
+    const [scaleX, scaleY] = [width / camera.size_px[0], height / camera.size_px[1]];
+    const request: PictureRequest = {
+      ...this.common(),
+      world_from_camera: camera.world_from_camera,
+      size_px: [width, height],
+      projection: {
+        kind: "pinhole",
+        focal_px: [camera.focal_px[0] * scaleX, camera.focal_px[1] * scaleY],
+        principal_px: [camera.principal_px[0] * scaleX, camera.principal_px[1] * scaleY],
+      },
+      outputs: ["color", "depth"],
+    };
+    const timer = window.setTimeout(() => this.side.abandon("the server has not drawn this view yet"), TIMEOUT_MILLIS);
+    try {
+      return await decodeRender(await this.side.request(request));
+    } catch (error) {
+      return reasonOf(error);
+    } finally {
+      window.clearTimeout(timer);
+    }
+  }
+
+  /** Compares a live image with the model as it is now. */
+  async compareLive({ header, jpeg }: PosedImage): Promise<Comparison> {
+    const [photo, render] = await Promise.all([decodeLive(jpeg), this.render(header, header.size_px)]);
+    return comparison(photo, render);
+  }
+}
+
 export class KeyframeComparer {
   /** The photograph that was requested last. */
   private last: { key: string; photo: DecodedPhoto } | null = null;
 
   constructor(
     private readonly photos: KeyframePhotos,
-    private readonly side: SideView,
-    private readonly common: () => CommonRequest,
+    private readonly renderer: PoseRenderer,
     private readonly maxPx: [number, number],
     private readonly isUrgent: boolean,
   ) {}
@@ -61,15 +119,9 @@ export class KeyframeComparer {
         onPhoto?.(photo);
         return photo;
       }),
-      this.render(keyframe, sizePx),
+      this.renderer.render(keyframe, sizePx),
     ]);
-    const isComplete = typeof photo !== "string" && typeof render !== "string";
-    return {
-      keyframe,
-      photo,
-      render: typeof render === "string" ? render : render.image,
-      errors: isComplete ? compareKeyframe(photo.image, render.image, { mask: photo.mask, surface: render.surface }) : null,
-    };
+    return comparison(photo, render);
   }
 
   private async photo(keyframe: NumberedKeyframe): Promise<DecodedPhoto | string> {
@@ -84,32 +136,23 @@ export class KeyframeComparer {
       return reasonOf(error);
     }
   }
+}
 
-  private async render(
-    keyframe: NumberedKeyframe,
-    [width, height]: [number, number],
-  ): Promise<{ image: ImageData; surface: Uint8Array | null } | string> {
-    if (!this.side.isPossible) return "the server draws no other views";
-    const [scaleX, scaleY] = [width / keyframe.size_px[0], height / keyframe.size_px[1]];
-    const request: PictureRequest = {
-      ...this.common(),
-      world_from_camera: keyframe.world_from_camera,
-      size_px: [width, height],
-      projection: {
-        kind: "pinhole",
-        focal_px: [keyframe.focal_px[0] * scaleX, keyframe.focal_px[1] * scaleY],
-        principal_px: [keyframe.principal_px[0] * scaleX, keyframe.principal_px[1] * scaleY],
-      },
-      outputs: ["color", "depth"],
-    };
-    const timer = window.setTimeout(() => this.side.abandon("the server has not drawn this view yet"), TIMEOUT_MILLIS);
-    try {
-      return await decodeRender(await this.side.request(request));
-    } catch (error) {
-      return reasonOf(error);
-    } finally {
-      window.clearTimeout(timer);
-    }
+function comparison(photo: DecodedPhoto | string, render: Render | string): Comparison {
+  const isComplete = typeof photo !== "string" && typeof render !== "string";
+  return {
+    photo,
+    render: typeof render === "string" ? render : render.image,
+    newestMillis: typeof render === "string" ? null : render.newestMillis,
+    errors: isComplete ? compareKeyframe(photo.image, render.image, { mask: photo.mask, surface: render.surface }) : null,
+  };
+}
+
+async function decodeLive(jpeg: Uint8Array<ArrayBuffer>): Promise<DecodedPhoto | string> {
+  try {
+    return { header: null, image: await pixelsOf(jpeg, { offset: 0, bytes: jpeg.byteLength }), mask: null };
+  } catch (error) {
+    return reasonOf(error);
   }
 }
 
@@ -124,10 +167,11 @@ async function decodePhoto({ header, payload }: Photo): Promise<DecodedPhoto> {
   };
 }
 
-async function decodeRender({ header, payload }: SidePicture): Promise<{ image: ImageData; surface: Uint8Array | null }> {
+async function decodeRender({ header, payload }: SidePicture): Promise<Render> {
   if (!header.color) throw new Error("the model's picture has no colors");
   const image = await pixelsOf(payload, header.color);
-  if (!header.depth) return { image, surface: null };
+  const newestMillis = header.newest_keyframe?.captured_millis ?? null;
+  if (!header.depth) return { image, surface: null, newestMillis };
   const { depth, sizePx } = await decodeDepth(header.depth, payload);
   const surface = new Uint8Array(image.width * image.height);
   for (let y = 0; y < image.height; y++) {
@@ -136,7 +180,7 @@ async function decodeRender({ header, payload }: SidePicture): Promise<{ image: 
       surface[y * image.width + x] = depth[row + Math.floor((x * sizePx[0]) / image.width)]! > 0 ? 1 : 0;
     }
   }
-  return { image, surface };
+  return { image, surface, newestMillis };
 }
 
 async function pixelsOf(payload: Uint8Array<ArrayBuffer>, part: { offset: number; bytes: number }): Promise<ImageData> {

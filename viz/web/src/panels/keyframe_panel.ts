@@ -1,4 +1,4 @@
-// The elements of the keyframe browser: photograph and model behind a wiper, map of the error, facts and faults.
+// The elements of the comparison of camera images with the model: photograph and model behind a wiper, map of the error, facts and faults.
 
 import { make, setText } from "./html";
 import type { DecodedPhoto } from "./keyframe_comparison";
@@ -27,8 +27,10 @@ const COLORS = [
 const MASKED_COLOR = [58, 66, 78] as const;
 
 export class KeyframePanel {
-  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", ariaLabel: "Keyframe", tabIndex: -1, hidden: true });
+  readonly root = make("section", { id: "keyframe-browser", className: "panel keyframe-browser", ariaLabel: "Compare", tabIndex: -1, hidden: true });
   private readonly title = make("h2", { id: "keyframe-title", ariaLive: "polite" });
+  /** The list of what can be compared. */
+  readonly sourceList = make("select", { id: "compare-source", title: "What is compared with the model" });
   private readonly order = make("select", { id: "keyframe-order", title: "Order of the keyframes" });
   private readonly photo = make("canvas", { id: "keyframe-photo", role: "img", ariaLabel: "Photograph" });
   private readonly render = make("canvas", { id: "keyframe-render", role: "img", ariaLabel: "Model, from the same pose" });
@@ -38,6 +40,8 @@ export class KeyframePanel {
   private readonly error = make("canvas", { id: "keyframe-error", role: "img", ariaLabel: "Map of the error" });
   private readonly facts = make("dl", { id: "keyframe-facts" });
   private readonly faults = make("ul", { id: "keyframe-faults" });
+  /** The buttons that choose another keyframe. */
+  private readonly steps: HTMLButtonElement[] = [];
   private shownFacts = "";
   private readonly progress = make("span", { id: "keyframe-progress" });
 
@@ -45,6 +49,7 @@ export class KeyframePanel {
     this.root.setAttribute("aria-labelledby", this.title.id);
     this.order.append(new Option("oldest first", "time"), new Option("largest error first", "error"));
     this.order.ariaLabel = this.order.title;
+    this.sourceList.ariaLabel = this.sourceList.title;
     this.order.addEventListener("change", () => events.order(this.order.value as KeyframeOrder));
     this.wiper.ariaLabel = "Boundary between the photograph on the left and the model on the right";
     this.wiper.addEventListener("input", () => this.wipe());
@@ -65,6 +70,11 @@ export class KeyframePanel {
     return !this.root.hidden;
   }
 
+  /** Whether the user chooses keyframes. */
+  set canStep(canStep: boolean) {
+    for (const control of [...this.steps, this.order, this.progress]) control.hidden = !canStep;
+  }
+
   /** Whether keyframes can be sorted by their error. */
   set canSort(canSort: boolean) {
     this.order.disabled = !canSort;
@@ -79,11 +89,16 @@ export class KeyframePanel {
   clear(note: string, [width, height]: [number, number]): void {
     for (const canvas of [this.photo, this.render, this.error]) canvas.width = 0;
     // The panel keeps its layout while the images are loaded.
-    for (const { style } of [this.views, this.error]) style.aspectRatio = `${width} / ${height}`;
+    this.showSize([width, height]);
     this.views.dataset.missing = "";
     this.problem.textContent = note;
     this.showFacts([], []);
     this.root.dataset.state = "waiting";
+  }
+
+  /** Gives the images the shape of this size. */
+  showSize([width, height]: [number, number]): void {
+    for (const { style } of [this.views, this.error]) style.aspectRatio = `${width} / ${height}`;
   }
 
   showPhoto(photo: DecodedPhoto | string): void {
@@ -133,11 +148,15 @@ export class KeyframePanel {
 
   private head(): HTMLElement {
     const head = make("div", { className: "head" });
-    head.append(
-      this.title,
+    this.steps.push(
       this.button("keyframe-previous", "‹", "Previous keyframe (left arrow key)", () => this.events.step(-1)),
       this.button("keyframe-next", "›", "Next keyframe (right arrow key)", () => this.events.step(1)),
       this.button("keyframe-nearest", "Nearest", "The keyframe nearest to the view", () => this.events.nearest()),
+    );
+    head.append(
+      this.title,
+      this.sourceList,
+      ...this.steps,
       this.order,
       this.progress,
       this.button("keyframe-close", "×", "Close (Esc)", () => this.events.close()),
@@ -148,7 +167,7 @@ export class KeyframePanel {
   private figures(): HTMLElement {
     const compared = make("figure");
     const caption = make("figcaption");
-    caption.append(make("span", { textContent: "photograph" }), make("span", { textContent: "model" }));
+    caption.append(make("span", { textContent: "camera image" }), make("span", { textContent: "model" }));
     this.views.append(this.photo, this.render, this.problem);
     // The boundary follows a drag over the images, too.
     this.views.addEventListener("pointerdown", (event) => {
@@ -162,7 +181,7 @@ export class KeyframePanel {
     const error = make("figure");
     const scale = make("i");
     scale.style.background = `linear-gradient(to right, ${COLORS.map((color) => `rgb(${color.join(" ")})`).join(", ")})`;
-    const labels = make("figcaption", { title: "Difference of photograph and model; gray: not trained on" });
+    const labels = make("figcaption", { title: "Difference of the camera image and the model; gray: not trained on" });
     const percents = ["error 0", `${50 * MAX_ERROR} %`, `${100 * MAX_ERROR} % or more`];
     labels.append(...percents.map((textContent) => make("span", { textContent })));
     error.append(this.error, scale, labels);
@@ -174,7 +193,7 @@ export class KeyframePanel {
   private buttons(): HTMLElement {
     const buttons = make("p", { className: "buttons" });
     buttons.append(
-      this.button("keyframe-look", "Look from here", "Move the view to the pose of this keyframe", () =>
+      this.button("keyframe-look", "Look from here", "Move the view to the pose of this image", () =>
         this.events.lookFrom(),
       ),
     );

@@ -91,6 +91,18 @@ export class LiveImages {
     for (const slot of this.slots.values()) this.place(slot);
   }
 
+  /** Cameras whose images are in the side panel. */
+  get dockedCameras(): string[] {
+    return [...this.docked];
+  }
+
+  set dockedCameras(cameras: readonly string[]) {
+    this.docked.clear();
+    for (const camera of cameras) this.docked.add(camera);
+    store(DOCKED_KEY, JSON.stringify(cameras));
+    for (const slot of this.slots.values()) this.place(slot);
+  }
+
   /** Moves an image to where it belongs, and describes its button. */
   private place({ figure, dock }: Slot): void {
     const isDocked = this.docked.has(figure.dataset.camera!);

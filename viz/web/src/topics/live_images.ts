@@ -1,6 +1,7 @@
 // The current images of the cameras, at the size at which they are shown.
 
 import { element } from "../panels/element";
+import type { PosedImage } from "../panels/keyframe_comparison";
 import type { LiveImages } from "../panels/live_images";
 import type { OrbitView } from "../view/orbit_view";
 import type { LiveImageHeader, PosedCamera } from "../connection/protocol";
@@ -17,6 +18,8 @@ const ROOMY_HEIGHT = { min: 120, max: 420, ofWindow: 0.34 };
 const MAX_IMAGE_WIDTH_PX = 640;
 /** Maximum size of images that are enlarged or fill the view. */
 const ENLARGED_PX: [number, number] = [1280, 960];
+/** Maximum size of images that are compared with the model. */
+const COMPARED_PX: [number, number] = [640, 640];
 /** The pose of a camera is not current if the newest image of any camera is newer by this. */
 const CURRENT_MILLIS = 5000;
 /** The server rounds image sizes down to multiples of this. */
@@ -35,11 +38,15 @@ export class LiveImagesTopic implements Topic {
       element("look-live", HTMLButtonElement).disabled = false;
       const posed = { ...header, world_from_camera: header.world_from_camera };
       this.posed.set(header.camera, posed);
+      if (header.camera === this.comparedCamera) this.onCompared({ header: posed, jpeg: payload });
       this.view.attachment.seen(posed);
       const hasMoved = this.view.overlays.setLiveCamera(posed, header.captured_millis);
       if (hasMoved) this.view.changed();
     }),
   ];
+  /** Called with each image of the compared camera. */
+  onCompared: (image: PosedImage) => void = () => undefined;
+  private comparedCamera: string | null = null;
   private isShown = true;
   private isRoomy = false;
   private fillsView = false;
@@ -77,6 +84,15 @@ export class LiveImagesTopic implements Topic {
     this.changed();
   }
 
+  /** The camera whose images are compared with the model. */
+  set compared(camera: string | null) {
+    if (camera === this.comparedCamera) return;
+    this.comparedCamera = camera;
+    // From now on, its images have a separate size.
+    if (camera !== null && !this.images.resized.has(camera)) this.images.resized.set(camera, false);
+    this.changed();
+  }
+
   subscriptions(isHidden: boolean): Subscription[] {
     const cameras = [...this.images.resized];
     if (isHidden) return [{ rate_hz: 0 }, ...cameras.map(([camera]) => ({ camera, rate_hz: 0 }))];
@@ -86,7 +102,7 @@ export class LiveImagesTopic implements Topic {
       ...cameras.map(([camera, isEnlarged]) => ({
         rate_hz: camera === this.images.ridden ? RIDDEN_HZ : HZ,
         camera,
-        size_px: sizePx(isEnlarged && this.isShown),
+        size_px: camera === this.comparedCamera ? COMPARED_PX : sizePx(isEnlarged && this.isShown),
       })),
     ];
   }

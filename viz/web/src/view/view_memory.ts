@@ -18,12 +18,20 @@ const WRITE_MILLIS = 1000;
 const SWITCHES = ".layers [id^=toggle-][aria-pressed]:not(#toggle-cut), #toggle-crop";
 const TOGGLE = "toggle-";
 
+/** What is shown. */
+export interface ShownState extends Omit<Remembered, "switched"> {
+  /** The switches by name, such as `grid`, and whether they are on. */
+  switches: Record<string, boolean>;
+}
+
 export class ViewMemory {
   /** The switches that are pressed initially. */
   private readonly initiallyOn = new Set(switches().filter(isOn).map((button) => button.id));
   /** Whether the user has acted. Before that, the address is not changed. */
   private hasUserActed = false;
   private written: string | null = null;
+  /** Whether the page began with a view of its address or of an earlier load. */
+  private hasEarlierView = false;
 
   constructor(
     private readonly view: OrbitView,
@@ -36,7 +44,14 @@ export class ViewMemory {
     window.setInterval(() => this.write(), WRITE_MILLIS);
     window.addEventListener("pagehide", () => this.write());
     window.addEventListener("hashchange", () => this.show(textInFragment(location.hash)));
-    this.show(textAtStart());
+    const earlier = textAtStart();
+    this.hasEarlierView = decoded(earlier ?? "") !== null;
+    this.show(earlier);
+  }
+
+  /** Whether the view is the one with which every page begins. */
+  get isUntouched(): boolean {
+    return !this.hasEarlierView && !this.hasUserActed;
   }
 
   /** The present view, without the camera path, as text for [`show`]. */
@@ -66,28 +81,19 @@ export class ViewMemory {
     store(STORED_KEY, this.written, "sessionStorage");
   }
 
-  private get present(): Remembered {
-    return {
-      view: this.view.state(),
-      switched: switches()
-        .filter((button) => isOn(button) !== this.initiallyOn.has(button.id))
-        .map((button) => button.id.slice(TOGGLE.length)),
-      crop: this.view.crop.changedBox,
-      method: this.models.preferred,
-      path: this.settings.pathViews.map(({ position, target, fovDegrees }) => ({
-        position: position.toArray(),
-        target: target.toArray(),
-        fovDegrees,
-      })),
-    };
+  /** What is shown now. */
+  get state(): ShownState {
+    const { view, crop, method, path } = this.present;
+    return { view, crop, method, path, switches: Object.fromEntries(switches().map((button) => [nameOf(button), isOn(button)])) };
   }
 
-  private restore({ view, switched, crop, method, path }: Remembered): void {
-    this.models.prefer(method);
+  /** Shows the given parts. Other parts, and switches without a value, stay as they are. */
+  change({ view, switches: wanted = {}, crop, method, path = [] }: Partial<ShownState>): void {
+    if (method !== undefined) this.models.prefer(method);
     if (crop) this.view.crop.restore(crop);
     for (const button of switches()) {
-      const isSwitched = switched.includes(button.id.slice(TOGGLE.length));
-      press(button, this.initiallyOn.has(button.id) !== isSwitched);
+      const isWanted = wanted[nameOf(button)];
+      if (isWanted !== undefined) press(button, isWanted);
     }
     if (view) {
       // Flying changes the target, so it begins before the view is restored.
@@ -101,6 +107,28 @@ export class ViewMemory {
         fovDegrees,
       })),
     );
+  }
+
+  private get present(): Remembered {
+    return {
+      view: this.view.state(),
+      switched: switches()
+        .filter((button) => isOn(button) !== this.initiallyOn.has(button.id))
+        .map(nameOf),
+      crop: this.view.crop.changedBox,
+      method: this.models.preferred,
+      path: this.settings.pathViews.map(({ position, target, fovDegrees }) => ({
+        position: position.toArray(),
+        target: target.toArray(),
+        fovDegrees,
+      })),
+    };
+  }
+
+  private restore({ switched, ...parts }: Remembered): void {
+    const isSwitched = (button: HTMLElement): boolean => switched.includes(nameOf(button));
+    const state = switches().map((button) => [nameOf(button), this.initiallyOn.has(button.id) !== isSwitched(button)]);
+    this.change({ ...parts, switches: Object.fromEntries(state) as Record<string, boolean> });
   }
 
   /** Writes the view to the address and to the storage of the tab, if it has changed. */
@@ -123,6 +151,11 @@ function textAtStart(): string | null {
 
 function switches(): HTMLElement[] {
   return [...document.querySelectorAll<HTMLElement>(SWITCHES)];
+}
+
+/** The name of a switch. */
+function nameOf(button: HTMLElement): string {
+  return button.id.slice(TOGGLE.length);
 }
 
 function isOn(button: HTMLElement): boolean {
