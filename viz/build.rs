@@ -7,7 +7,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Files written by `scripts/build-web.sh`.
-const BUNDLE: [&str; 8] = [
+const BUNDLE: [&str; 9] = [
     "web/dist/index.html",
     "web/dist/app.js",
     "web/dist/splat_worker.js",
@@ -15,6 +15,7 @@ const BUNDLE: [&str; 8] = [
     "web/dist/mesh_loaders.js",
     "web/dist/coverage.js",
     "web/dist/steering.js",
+    "web/dist/headset.js",
     "web/dist/app.css",
 ];
 /// The page of binaries built without Node.js.

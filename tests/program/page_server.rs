@@ -63,6 +63,7 @@ fn send_file(mut stream: TcpStream, head: &str) {
         "/mesh_loaders.js" => ("mesh_loaders.js", "text/javascript"),
         "/coverage.js" => ("coverage.js", "text/javascript"),
         "/steering.js" => ("steering.js", "text/javascript"),
+        "/headset.js" => ("headset.js", "text/javascript"),
         "/app.css" => ("app.css", "text/css"),
         _ => ("", "text/plain"),
     };
