@@ -7,7 +7,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Files written by `scripts/build-web.sh`.
-const BUNDLE: [&str; 10] = [
+const BUNDLE: [&str; 11] = [
     "web/dist/index.html",
     "web/dist/app.js",
     "web/dist/splat_worker.js",
@@ -17,6 +17,7 @@ const BUNDLE: [&str; 10] = [
     "web/dist/study_page.js",
     "web/dist/workspace_page.js",
     "web/dist/steering.js",
+    "web/dist/headset.js",
     "web/dist/app.css",
 ];
 /// The page of binaries built without Node.js.

@@ -65,6 +65,7 @@ fn send_file(mut stream: TcpStream, head: &str) {
         "/study_page.js" => ("study_page.js", "text/javascript"),
         "/workspace_page.js" => ("workspace_page.js", "text/javascript"),
         "/steering.js" => ("steering.js", "text/javascript"),
+        "/headset.js" => ("headset.js", "text/javascript"),
         "/app.css" => ("app.css", "text/css"),
         _ => ("", "text/plain"),
     };

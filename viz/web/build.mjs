@@ -32,7 +32,7 @@ const withoutRenderer = {
     onResolve({ filter: /^three$/ }, () => ({ path: join(here, "node_modules/three/build/three.core.js") }));
   },
 };
-/** The classes of three.js that the page has, for a script that draws with them: see src/steering/steering_loader.ts. */
+/** The classes of three.js that the page has, for a script that draws with them: see src/three_of_the_page.ts. */
 const threeOfThePage = {
   name: "three of the page",
   setup({ onResolve, onLoad }) {
@@ -63,7 +63,7 @@ await build({
 });
 await build({
   ...options,
-  entryPoints: { steering: join(here, "src/steering/steering.ts") },
+  entryPoints: { steering: join(here, "src/steering/steering.ts"), headset: join(here, "src/headset/headset.ts") },
   format: "esm",
   plugins: [threeOfThePage],
 });

@@ -82,6 +82,12 @@ pub(crate) const FILES: &[PageFile] = &[
         "steering.js"
     ),
     page_file!(
+        "/headset.js",
+        "text/javascript; charset=utf-8",
+        "../../web/dist/",
+        "headset.js"
+    ),
+    page_file!(
         "/app.css",
         "text/css; charset=utf-8",
         "../../web/dist/",

@@ -12,6 +12,8 @@ mod eye_page;
 #[cfg(feature = "foxglove")]
 mod foxglove;
 mod hands_page;
+mod headset_page;
+mod headset_steering;
 mod keyframe_browser_page;
 mod keyframe_images;
 mod labels_page;

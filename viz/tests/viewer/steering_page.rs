@@ -26,43 +26,43 @@ use viz::{
 const WINDOW_PX: [u32; 2] = [1280, 760];
 const PHONE_PX: [u32; 2] = [390, 844];
 /// Positions of the joints in the order of the robot's description: slide, rotate.
-const POSITION: [f64; 2] = [0.2, 0.0];
+pub(crate) const POSITION: [f64; 2] = [0.2, 0.0];
 /// Every round trip is shorter, so that the arm follows the hand.
-const FOLLOWS_MILLIS: f64 = 1e6;
+pub(crate) const FOLLOWS_MILLIS: f64 = 1e6;
 /// Every round trip is longer, so that the page previews.
-const PREVIEWS_MILLIS: f64 = 1e-6;
+pub(crate) const PREVIEWS_MILLIS: f64 = 1e-6;
 /// The page of a busy computer draws slowly. This test is not about pauses between samples.
 const EXPIRY_SECS: f64 = 1e4;
 /// Where the scripted arm is refused, in the frame of its base.
 const PLACE: [f64; 3] = [0.3, 0.0, 0.3];
 /// Number of samples after which a released switch is regarded as open.
-const N_OPEN: usize = 10;
+pub(crate) const N_OPEN: usize = 10;
 
 /// What the scripted arm has received, and what it reports.
 #[derive(Default)]
-struct Script {
+pub(crate) struct Script {
     holder: Option<u64>,
     stop: Option<String>,
     limits: Vec<AppliedLimit>,
     verdict: Option<PreviewVerdict>,
-    commands: Vec<SteeringCommand>,
-    previews: Vec<PreviewGoal>,
+    pub(crate) commands: Vec<SteeringCommand>,
+    pub(crate) previews: Vec<PreviewGoal>,
     /// Clients that have stopped the arm.
-    stops: Vec<u64>,
+    pub(crate) stops: Vec<u64>,
     n_renewed: usize,
     n_rearmed: usize,
 }
 
 /// An arm that decides as its script says, on a thread, like the loop of a run.
-struct ScriptedArm {
-    server: Arc<SteeringServer>,
-    script: Arc<Mutex<Script>>,
+pub(crate) struct ScriptedArm {
+    pub(crate) server: Arc<SteeringServer>,
+    pub(crate) script: Arc<Mutex<Script>>,
     is_over: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl ScriptedArm {
-    fn start(servo_round_trip_millis: f64) -> Self {
+    pub(crate) fn start(servo_round_trip_millis: f64) -> Self {
         let joint = |name: &str, range: [f64; 2], is_prismatic| SteeredJoint {
             name: name.to_owned(),
             lower: Some(range[0]),
@@ -110,11 +110,11 @@ impl ScriptedArm {
         change(&mut self.script.lock());
     }
 
-    fn last_command(&self) -> Option<SteeringCommand> {
+    pub(crate) fn last_command(&self) -> Option<SteeringCommand> {
         self.script.lock().commands.last().cloned()
     }
 
-    fn n_commands(&self) -> usize {
+    pub(crate) fn n_commands(&self) -> usize {
         self.script.lock().commands.len()
     }
 }
@@ -170,7 +170,7 @@ fn obey(server: &SteeringServer, script: &mut Script, client: u64, request: Stee
 }
 
 /// Pose of the tip in the base at [`POSITION`].
-fn base_from_tip() -> kinematics::Transform {
+pub(crate) fn base_from_tip() -> kinematics::Transform {
     let chain = Chain::from_urdf(robot::URDF, "pedestal", "tip").expect("a chain");
     let [slide, rotate] = POSITION;
     chain.forward(&[rotate, slide]).expect("a pose")
@@ -307,7 +307,7 @@ fn first_view() -> kinematics::Transform {
 }
 
 /// A scene with a robot, and the thread that draws it.
-fn hub_with_robot(last: &Arc<Mutex<Option<RenderRequest>>>) -> (Hub, RequestThread) {
+pub(crate) fn hub_with_robot(last: &Arc<Mutex<Option<RenderRequest>>>) -> (Hub, RequestThread) {
     let hub = Hub::new();
     hub.set_scene_hint(SceneHint {
         center_m: [0.0, 0.0, 0.2],

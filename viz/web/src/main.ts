@@ -7,6 +7,7 @@ import { LinkReadout } from "./connection/link_readout";
 import type { BinaryHeader, Status, TextMessage } from "./connection/protocol";
 import { RenderScheduler } from "./connection/render_scheduler";
 import { ShownLatency } from "./connection/shown_latency";
+import { HeadsetLoader } from "./headset/headset_loader";
 import { setUpKeys } from "./keys";
 import { SideView } from "./layers/side_view";
 import { Surroundings } from "./layers/surroundings";
@@ -164,6 +165,12 @@ const scheduler = new RenderScheduler(
   pictureInfo,
 );
 const sides = [new SideView(connection, "surroundings"), new SideView(connection, "video")] as const;
+const headsetSides = {
+  left: new SideView(connection, "left eye"),
+  right: new SideView(connection, "right eye"),
+  extra: new SideView(connection, "hand or sphere"),
+};
+const allSides = [...sides, ...Object.values(headsetSides)];
 const surroundings = new Surroundings(
   sides[0],
   (shown) => scheduler.picture(shown),
@@ -203,6 +210,19 @@ const timeSlider = new TimeSlider(keyframes, view, new TimePhoto(browser.photos)
 const settings = new ViewSettings(view, scheduler, sides[1]);
 new BoxPanel(view.crop);
 const steering = new SteeringLoader(view);
+const headset = new HeadsetLoader({
+  view,
+  prepareFrame,
+  moved: () => scheduler.moved(),
+  posedImages: () => liveImages.current,
+  steering: () => steering.loaded?.hands ?? null,
+  pictures: {
+    sides: headsetSides,
+    request: (shown) => scheduler.picture(shown),
+    isTraining: () => model.status?.state === "training",
+  },
+});
+topics.isPresented = () => headset.isInUse;
 setUpSavePicture(view, pictureInfo, () => model.status?.identity);
 setUpKeys(() => view.changed());
 setUpButtons({
@@ -249,7 +269,7 @@ function restart(): void {
   skeleton.awaitPicture();
   shownLatency.forget();
   model.forgetSurfaces();
-  for (const part of [flow, scheduler, ...sides, edits, browser, coverage, topics]) part.restart();
+  for (const part of [flow, scheduler, ...allSides, edits, browser, coverage, topics]) part.restart();
 }
 
 /** Forgets what only belongs to the run that was shown before. */
@@ -310,7 +330,7 @@ function receiveText(message: TextMessage): void {
       coverage.setScene(message);
       break;
     case "error":
-      if ([edits, ...sides, browser].some((part) => part.fail(message))) break;
+      if ([edits, ...allSides, browser].some((part) => part.fail(message))) break;
       // The skeleton already shows what is missing.
       picture.failed(message.id, preview.isOn || (skeleton.isVisible && !model.status?.keyframes) ? "" : message.message);
       break;
@@ -321,14 +341,15 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
   flow.received(header.type);
   if (browser.receive(header, payload)) return;
   if (header.type !== "picture") topics.receive(header, payload);
-  else if (!sides.some((side) => side.receive(header, payload))) void picture.receive(header, payload);
+  else if (!allSides.some((side) => side.receive(header, payload))) void picture.receive(header, payload);
 }
 
-function frame(): void {
+/** What the page does for each display refresh, of its own window or of a headset, before the view is drawn. */
+function prepareFrame(): void {
   shownLatency.frameBegins();
   settings.tick();
   // Until the chunks in view have arrived, pictures of the server are shown.
-  scheduler.drawsLocally = view.local.replacesPictures;
+  scheduler.drawsLocally = view.replacesPictures;
   if (!preview.isOn) scheduler.tick();
   pictureInfo.update();
   if (!view.usesSurroundings || settings.isPlaying) {
@@ -337,8 +358,15 @@ function frame(): void {
   } else if (view.needsSurroundings) {
     surroundings.tick(() => view.view(), models.method, view.isFlyingOrStopped);
   }
-  view.draw();
-  viewControls.update();
+}
+
+function frame(): void {
+  // Some browsers stop these frames while a headset is in use, and others do not.
+  if (!headset.isInUse) {
+    prepareFrame();
+    view.draw();
+    viewControls.update();
+  }
   requestAnimationFrame(frame);
 }
 requestAnimationFrame(frame);

@@ -7,7 +7,7 @@ import { ChunkArrival } from "./chunk_arrival";
 import { MeshLayer } from "./mesh_layer";
 import type { ObservationLayer } from "./observation_layer";
 import type { ModelChunkHeader } from "../connection/protocol";
-import { SplatLayer } from "./splat_layer";
+import { type SplatEyes, SplatLayer } from "./splat_layer";
 import type { View } from "../connection/render_scheduler";
 
 export class LocalCopy {
@@ -82,8 +82,14 @@ export class LocalCopy {
     return this.splats.setErased(boxes);
   }
 
-  /** Prepares to draw a view in a buffer of this size. */
-  setView(view: View, sizePx: [number, number]): void {
+  /** Prepares to draw a view in a buffer of this size, or for the eyes of a headset. */
+  setView(view: View, sizePx: [number, number], eyes: SplatEyes | null): void {
+    if (eyes) {
+      const head = worldFromCamera(view.world_from_camera);
+      this.meshes.setView(head, view.near_m);
+      this.splats.setEyes(eyes, this.worldFromModel);
+      return;
+    }
     const scale = [0, 1].map((axis) => sizePx[axis]! / view.size_px[axis]!);
     const focalPx: [number, number] = [
       view.projection.focal_px[0] * scale[0]!,
@@ -99,13 +105,13 @@ export class LocalCopy {
    * Prepares to draw a copy that is not shown yet, if enough has arrived. Returns whether the copy
    * can be shown. Splats can be drawn only after a worker has sorted them.
    */
-  prepare(isReady: boolean, view: View, sizePx: [number, number]): boolean {
+  prepare(isReady: boolean, view: View, sizePx: [number, number], eyes: SplatEyes | null): boolean {
     if (!isReady) {
       this.readyVersion = null;
       return false;
     }
     this.readyVersion ??= this.splats.version;
-    this.setView(view, sizePx);
+    this.setView(view, sizePx, eyes);
     return this.splats.isSorted(this.readyVersion);
   }
 

@@ -11,6 +11,7 @@ import { LocalCopy } from "./local_copy";
 import type { ObservationLayer } from "./observation_layer";
 import type { ModelChunkHeader, ModelChunksRemoved } from "../connection/protocol";
 import type { View } from "../connection/render_scheduler";
+import type { SplatEyes } from "./splat_layer";
 
 export class LocalModel {
   readonly root = new THREE.Group();
@@ -141,13 +142,13 @@ export class LocalModel {
    * Prepares to draw a view in a buffer of this size, if `root` is visible. Replaces the drawn copy if the next one is
    * ready.
    *
-   * `hasPicture` says whether the server's picture shows this view exactly.
+   * `hasPicture` says whether the server's picture shows this view exactly. `eyes` are those of a headset; null for the page.
    */
-  setView(view: View, sizePx: [number, number], hasPicture: boolean): void {
+  setView(view: View, sizePx: [number, number], hasPicture: boolean, eyes: SplatEyes | null = null): void {
     if (!this.root.visible) return;
     const { next } = this;
-    if (next?.prepare(this.isReady(next, hasPicture), view, sizePx)) this.showNext(next);
-    this.shown?.setView(view, sizePx);
+    if (next?.prepare(this.isReady(next, hasPicture), view, sizePx, eyes)) this.showNext(next);
+    this.shown?.setView(view, sizePx, eyes);
   }
 
   /** Whether a copy can be drawn without holes, and is not worse than the present picture. */

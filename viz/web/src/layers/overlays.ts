@@ -49,6 +49,7 @@ export class Overlays {
   /** The frustum of the keyframe that the operator looks at. */
   private readonly selected: THREE.LineSegments;
   private posed: (PosedCamera | NumberedKeyframe)[] = [];
+  private isInDepthBuffer = false;
 
   constructor(private readonly occlusion: Occlusion) {
     this.keyframes = this.lines(0xffffff, 0.45);
@@ -62,6 +63,15 @@ export class Overlays {
   set showsGround(visible: boolean) {
     this.ground.visible = visible;
     this.cameras.visible = visible;
+  }
+
+  /** Whether lines are in the depth buffer and drawn first, so that splats hide them and are hidden by them. */
+  set writesDepth(writesDepth: boolean) {
+    this.isInDepthBuffer = writesDepth;
+    this.root.renderOrder = writesDepth ? -1 : 0;
+    this.root.traverse((object) => {
+      if (object instanceof THREE.LineSegments) (object.material as THREE.Material).depthWrite = writesDepth;
+    });
   }
 
   /** Whether there are lines to draw. */
@@ -94,7 +104,7 @@ export class Overlays {
     const middle = [center.x, center.y].map((value) => Math.round(value / cell) * cell);
     grid.position.set(middle[0]!, middle[1]!, 0).applyQuaternion(this.worldFromUpright);
     grid.quaternion.premultiply(this.worldFromUpright);
-    Object.assign(grid.material, { transparent: true, opacity: 0.22, depthWrite: false });
+    Object.assign(grid.material, { transparent: true, opacity: 0.22, depthWrite: this.isInDepthBuffer });
     const axesHelper = axes(2 * cell);
     for (const drawn of [grid, axesHelper]) this.occlusion.apply(drawn.material as THREE.Material, ON_SURFACE);
     this.ground.add(grid, axesHelper);
@@ -109,6 +119,11 @@ export class Overlays {
   /** The keyframes whose frustums are drawn, and how deep these are, meters. */
   get drawnKeyframes(): { keyframes: (PosedCamera | NumberedKeyframe)[]; depthM: number } {
     return { keyframes: this.keyframes.visible ? this.posed : [], depthM: this.frustumDepth };
+  }
+
+  /** How deep the frustums of live cameras are, meters. */
+  get liveFrustumDepthM(): number {
+    return 1.6 * this.frustumDepth;
   }
 
   /** Draws the frustum of this keyframe larger and in another color, even if the others are hidden. */
@@ -177,12 +192,12 @@ export class Overlays {
     const isOutdated = before?.isOutdated ?? false;
     const pose = worldFromCamera(camera.world_from_camera);
     this.live.set(camera.camera, { lines, worldFromCamera: pose, key, capturedMillis, isOutdated });
-    setLines(lines, frustum(camera, 1.6 * this.frustumDepth));
+    setLines(lines, frustum(camera, this.liveFrustumDepthM));
     return true;
   }
 
   private lines(color: number, opacity: number): THREE.LineSegments {
-    const material = new THREE.LineBasicMaterial({ color, opacity, transparent: true, depthWrite: false });
+    const material = new THREE.LineBasicMaterial({ color, opacity, transparent: true, depthWrite: this.isInDepthBuffer });
     const segments = new THREE.LineSegments(new THREE.BufferGeometry(), this.occlusion.apply(material, ON_SURFACE));
     segments.frustumCulled = false;
     return segments;

@@ -50,6 +50,7 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
   uniform float opacity;
   uniform float saturation;
   uniform bool isMoved;
+  uniform bool hidesEmpty;
   uniform vec2 sizePx;
   uniform vec2 focalPx;
   uniform vec2 principalPx;
@@ -81,6 +82,7 @@ const FRAGMENT = /* glsl */ `${TINT}${DEPTH}
     vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
     float rendered = texture2D(depthMap, uv).r;
     float depth = orEmpty(rendered);
+    if (hidesEmpty && !(rendered > 0.0)) discard;
     if (isMoved && abs(pointInPicture.z - depth) > tolerance(uv, depth)) discard;
     vec3 pointInWorld = (worldFromPicture * vec4(pointInPicture * (depth / pointInPicture.z), 1.0)).xyz;
     vec3 color = texture2D(colorMap, uv).rgb;
@@ -134,6 +136,7 @@ export class PictureLayer {
         principalPx: { value: new THREE.Vector2() },
         emptyDepth: { value: 1 },
         isMoved: { value: false },
+        hidesEmpty: { value: false },
         opacity: { value: 1 },
         saturation: { value: 1 },
         ...observations.uniforms,
@@ -164,6 +167,11 @@ export class PictureLayer {
     const isChange = saturation!.value !== value;
     saturation!.value = value;
     return isChange;
+  }
+
+  /** Whether pixels without a model are left out, so that the real room is visible there. */
+  set hidesEmpty(hidesEmpty: boolean) {
+    this.mesh.material.uniforms.hidesEmpty!.value = hidesEmpty;
   }
 
   /** Opacity of the picture, 0 to 1. */

@@ -8,7 +8,30 @@ import { SplatClip } from "./splat_clip";
 import { SplatDepth } from "./splat_depth";
 import { SplatMemory } from "./splat_memory";
 import { SPLAT_FRAGMENT, SPLAT_VERTEX } from "./splat_shader";
-import type { FreeUnits, SetChunk, Sort, SortResult } from "./splat_sorter";
+import type { FillLens } from "./splat_fill";
+import type { FreeUnits, SetChunk, Sort, SortAround, SortResult } from "./splat_sorter";
+
+/** No splat is cut off. */
+const WHOLE = 1e9;
+
+/** The eyes of a headset, for which the same splats are drawn in one order. */
+export interface SplatEyes {
+  /** Pose of the head, in fieldrig's convention. It may contain a scale. */
+  worldFromHead: THREE.Matrix4;
+  /** The lens of one eye, for the count of covered pixels. */
+  lens: FillLens;
+  farM: number;
+  /** Square of the radius at which splats are cut off, standard deviations. */
+  maxReach: number;
+  /** Fraction of the splats to draw. */
+  share: number;
+  /** The head may move by this much before the splats are sorted again, world meters. */
+  toleranceM: number;
+  /** The lens of an eye in its viewport, pixels, and its pose. */
+  eyeOf(camera: THREE.Camera): { worldFromEye: THREE.Matrix4 } & FillLens;
+  /** Pixels that the splats cover in one eye, for each of the extents; see splat_fill.ts. */
+  onFill(coveredPx: readonly number[], nSplats: number): void;
+}
 
 export class SplatLayer {
   readonly mesh: THREE.Mesh<THREE.InstancedBufferGeometry, THREE.RawShaderMaterial>;
@@ -18,6 +41,10 @@ export class SplatLayer {
   private readonly units = new Map<number, number[]>();
   private worker: Worker | null = null;
   private isSorting = false;
+  private eyes: SplatEyes | null = null;
+  /** Where the head was when the newest order was requested, and the fraction of the splats in it. */
+  private sortedAround: { headInWorld: THREE.Vector3; share: number } | null = null;
+  private readonly worldFromModel = new THREE.Matrix4();
   /** View and version of the splats for which the newest order was requested. */
   private sortedFor = "";
   /** Counts the changes of the splats. */
@@ -58,12 +85,15 @@ export class SplatLayer {
         focalPx: { value: new THREE.Vector2() },
         principalPx: { value: new THREE.Vector2() },
         depthRange: { value: new THREE.Vector2() },
+        maxReach: { value: WHOLE },
+        ndcOfDepth: { value: new THREE.Vector2() },
         ...this.clip.uniforms,
         ...observations.uniforms,
       },
     });
     this.mesh = new THREE.Mesh(geometry, material);
     this.mesh.frustumCulled = false;
+    this.mesh.onBeforeRender = (_renderer, _scene, camera) => this.prepareEye(camera);
     this.depth = new SplatDepth(material);
   }
 
@@ -86,7 +116,10 @@ export class SplatLayer {
     const base = words.slice(0, 4 * header.n_splats);
     const free = old.slice(units.length);
     if (free.length > 0) this.post({ kind: "free", units: free });
-    this.post({ kind: "set", units, words: base, minM: header.min_m, maxM: header.max_m }, [base.buffer]);
+    const [minLog, maxLog] = header.log_scale_range;
+    const minLogScale = minLog + Math.log(header.scale_factor);
+    const logScaleStep = (maxLog - minLog) / 255;
+    this.post({ kind: "set", units, words: base, minM: header.min_m, maxM: header.max_m, minLogScale, logScaleStep }, [base.buffer]);
     this.splatsChanged();
   }
 
@@ -157,19 +190,59 @@ export class SplatLayer {
     focalPx: [number, number],
     [nearM, farM]: [number, number],
   ): void {
+    this.eyes = null;
+    this.sortedAround = null;
     if (this.units.size === 0) return;
+    this.mesh.material.depthTest = false;
+    const { uniforms } = this.mesh.material;
+    uniforms.maxReach!.value = WHOLE;
+    (uniforms.ndcOfDepth!.value as THREE.Vector2).set(0, 0);
+    this.setMemory(worldFromModel);
+    const sizePx: [number, number] = [width, height];
+    this.setLens(worldFromCamera, { sizePx, focalPx, principalPx: [0.5 * width, 0.5 * height], nearM }, farM);
+    this.requestOrder((uniforms.cameraFromModel!.value as THREE.Matrix4).elements);
+  }
+
+  /**
+   * Prepares to draw for the eyes of a headset. All eyes share one order. Splats have a depth, so that solid bodies and
+   * splats hide each other.
+   */
+  setEyes(eyes: SplatEyes, worldFromModel: THREE.Matrix4): void {
+    this.eyes = eyes;
+    if (this.units.size === 0) return;
+    this.mesh.material.depthTest = true;
+    this.mesh.material.uniforms.maxReach!.value = eyes.maxReach;
+    this.setMemory(worldFromModel);
+    this.requestOrderAround(eyes);
+  }
+
+  private setMemory(worldFromModel: THREE.Matrix4): void {
     const { uniforms } = this.mesh.material;
     for (const name of ["base", "harmonics", "units"] as const) uniforms[name]!.value = this.memory[name];
-    const modelFromCamera = worldFromModel.clone().invert().multiply(worldFromCamera);
-    const cameraFromModel = uniforms.cameraFromModel!.value as THREE.Matrix4;
-    cameraFromModel.copy(modelFromCamera).invert();
+    this.worldFromModel.copy(worldFromModel);
     (uniforms.worldFromModel!.value as THREE.Matrix4).copy(worldFromModel);
+  }
+
+  private setLens(worldFromCamera: THREE.Matrix4, { sizePx, focalPx, principalPx, nearM }: FillLens, farM: number): void {
+    const { uniforms } = this.mesh.material;
+    const modelFromCamera = this.worldFromModel.clone().invert().multiply(worldFromCamera);
+    (uniforms.cameraFromModel!.value as THREE.Matrix4).copy(modelFromCamera).invert();
     this.vector3("eyeInModel").setFromMatrixPosition(modelFromCamera);
-    (uniforms.sizePx!.value as THREE.Vector2).set(width, height);
+    (uniforms.sizePx!.value as THREE.Vector2).fromArray(sizePx);
     (uniforms.focalPx!.value as THREE.Vector2).fromArray(focalPx);
-    (uniforms.principalPx!.value as THREE.Vector2).set(0.5 * width, 0.5 * height);
+    (uniforms.principalPx!.value as THREE.Vector2).fromArray(principalPx);
     (uniforms.depthRange!.value as THREE.Vector2).set(nearM, farM);
-    this.requestOrder(cameraFromModel.elements);
+  }
+
+  /** Called before the splats are drawn for a camera. */
+  private prepareEye(camera: THREE.Camera): void {
+    if (!this.eyes || this.units.size === 0) return;
+    const { material } = this.mesh;
+    const eye = this.eyes.eyeOf(camera);
+    this.setLens(eye.worldFromEye, eye, this.eyes.farM);
+    const projection = camera.projectionMatrix.elements;
+    (material.uniforms.ndcOfDepth!.value as THREE.Vector2).set(projection[10]!, projection[14]!);
+    material.uniformsNeedUpdate = true;
   }
 
   /** Draws the depth of the view, see splat_depth.ts; null if that is not possible. */
@@ -188,9 +261,27 @@ export class SplatLayer {
     this.post({ kind: "sort", forward: [x, y, z], offset });
   }
 
-  private adopt({ order }: SortResult): void {
+  /** Sorts the splats around the head unless it has hardly moved. */
+  private requestOrderAround({ worldFromHead, lens, share, toleranceM }: SplatEyes): void {
+    if (this.isSorting) return;
+    const headInWorld = new THREE.Vector3().setFromMatrixPosition(worldFromHead);
+    const last = this.sortedAround;
+    const isSorted = this.nChangesRequested === this.nChanges && last?.share === share;
+    if (isSorted && last.headInWorld.distanceTo(headInWorld) <= toleranceM) return;
+    this.isSorting = true;
+    this.sortedFor = "";
+    this.sortedAround = { headInWorld, share };
+    this.nChangesRequested = this.nChanges;
+    const modelFromHead = this.worldFromModel.clone().invert().multiply(worldFromHead);
+    const eye = new THREE.Vector3().setFromMatrixPosition(modelFromHead).toArray();
+    const cameraFromModel = modelFromHead.invert().transpose().elements.slice(0, 12);
+    this.post({ kind: "sort around", eye, cameraFromModel, lens, share });
+  }
+
+  private adopt({ order, coveredPx }: SortResult): void {
     this.isSorting = false;
     if (this.units.size === 0) return; // The order is for splats that are gone.
+    if (coveredPx) this.eyes?.onFill(coveredPx, order.length);
     const { geometry } = this.mesh;
     let slots = geometry.getAttribute("slot") as THREE.InstancedBufferAttribute | undefined;
     if (!slots || slots.count < order.length) {
@@ -210,7 +301,7 @@ export class SplatLayer {
     this.changed();
   }
 
-  private post(message: SetChunk | FreeUnits | Sort, transfer: Transferable[] = []): void {
+  private post(message: SetChunk | FreeUnits | Sort | SortAround, transfer: Transferable[] = []): void {
     if (!this.worker) {
       this.worker = new Worker("splat_worker.js");
       this.worker.onmessage = ({ data }: MessageEvent<SortResult>) => this.adopt(data);

@@ -28,6 +28,8 @@ export const SPLAT_VERTEX = /* glsl */ `
   uniform vec2 focalPx;
   uniform vec2 principalPx;
   uniform vec2 depthRange;
+  uniform float maxReach;  // square of the radius at which splats are cut off, standard deviations
+  uniform vec2 ndcOfDepth; // depth buffer: y / depth - x, or 0 if it is not used
   in vec3 position;
   in uint slot;
   out vec2 deviations;
@@ -116,7 +118,7 @@ ${TINT}
     }
 
     // The quad lies along the axes of the ellipse. Its corners are in standard deviations.
-    reach = 2.0 * log(255.0 * alpha);
+    reach = min(2.0 * log(255.0 * alpha), maxReach);
     float middle = 0.5 * (xx + yy);
     float spread = length(vec2(0.5 * (xx - yy), xy));
     vec2 along = abs(xy) > 1e-6 * middle ? normalize(vec2(xy, middle + spread - xx))
@@ -134,7 +136,7 @@ ${TINT}
     clipPoint = inWorld + worldAxes * rowX * conicPx.x + worldAxes * rowY * conicPx.y;
 #endif
     vec2 px = focalPx * ratio + principalPx + offsetPx;
-    gl_Position = vec4(2.0 * px.x / sizePx.x - 1.0, 1.0 - 2.0 * px.y / sizePx.y, 0.0, 1.0);
+    gl_Position = vec4(2.0 * px.x / sizePx.x - 1.0, 1.0 - 2.0 * px.y / sizePx.y, ndcOfDepth.y / point.z - ndcOfDepth.x, 1.0);
 
     depth = point.z;
     vec3 rgb = vec3(uvec3(words.w >> 8u, words.w >> 16u, words.w >> 24u) & 255u) / 127.5 - 0.5;

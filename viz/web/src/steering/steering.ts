@@ -16,6 +16,7 @@ import { firstPad } from "./gamepad";
 import { Ghost, type GhostParts } from "./ghost";
 import { isApart, lookOfLimits, lookOfVerdict, LOOKS } from "./ghost_looks";
 import { Gizmo } from "./gizmo";
+import { HandSteering } from "./hand_steering";
 import { holdButton } from "./hold_button";
 import { axesOf, type FrameName, type FrameRotations } from "./jog";
 import { JogKeys } from "./jog_keys";
@@ -61,6 +62,7 @@ export class Steering {
   private readonly jogPad: JogPad;
   private readonly jogKeys: JogKeys;
   private readonly limits: LimitsList;
+  private handSteering: HandSteering | null = null;
   private shownMillis = -Infinity;
   private shownMode = "";
   /** The last view that was sent, as text, and when. */
@@ -115,6 +117,12 @@ export class Steering {
     this.setUpControls();
     this.listenToThePage(canvas);
     window.setInterval(() => this.tick(), TICK_MILLIS);
+  }
+
+  /** How a headset steers. */
+  get hands(): HandSteering {
+    this.handSteering ??= new HandSteering(this.commander, () => this.worldFromBase, () => this.draw());
+    return this.handSteering;
   }
 
   /** Whether the server has an arm that can be steered. */

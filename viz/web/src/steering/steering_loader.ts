@@ -1,8 +1,6 @@
 // Loads the script for steering once a server has an arm that can be steered, or the incidents of a steered run. The script
-// uses the classes of three.js of the page, because a second copy would be large, and its objects would have the same numbers
-// as those of the page.
+// uses the classes of three.js of the page.
 
-import * as THREE from "three";
 import { action, toggle } from "../keys";
 import { RobotLayer } from "../layers/robot_layer";
 import { element } from "../panels/element";
@@ -10,28 +8,9 @@ import { reasonOf } from "../panels/sentence";
 import { showToast } from "../panels/toast";
 import type { FileLink } from "../connection/protocol";
 import type { Incidents } from "../incidents/incidents";
+import { shareThree } from "../three_of_the_page";
 import type { OrbitView } from "../view/orbit_view";
 import type { PageParts, Steering } from "./steering";
-
-/** The part of three.js that the script uses. tests/steering_loader.test.ts compares it with the imports. */
-const SHARED = {
-  CylinderGeometry: THREE.CylinderGeometry,
-  DoubleSide: THREE.DoubleSide,
-  Group: THREE.Group,
-  MathUtils: THREE.MathUtils,
-  Matrix4: THREE.Matrix4,
-  Mesh: THREE.Mesh,
-  MeshBasicMaterial: THREE.MeshBasicMaterial,
-  MeshLambertMaterial: THREE.MeshLambertMaterial,
-  Object3D: THREE.Object3D,
-  Plane: THREE.Plane,
-  Quaternion: THREE.Quaternion,
-  Raycaster: THREE.Raycaster,
-  SphereGeometry: THREE.SphereGeometry,
-  TorusGeometry: THREE.TorusGeometry,
-  Vector2: THREE.Vector2,
-  Vector3: THREE.Vector3,
-};
 
 /** Name of the file with the incidents. */
 const INCIDENTS = "/steering-incidents.json";
@@ -63,11 +42,16 @@ export class SteeringLoader {
     else if (file) void this.load();
   }
 
+  /** The steering; null before it is loaded. */
+  get loaded(): Steering | null {
+    return this.isOffered ? this.steering : null;
+  }
+
   private async load(): Promise<void> {
     if (this.isLoading) return;
     this.isLoading = true;
     try {
-      Object.assign(globalThis, { fieldrigThree: SHARED });
+      shareThree();
       const script = await import("./steering");
       const { view } = this;
       const newRobotLayer: PageParts["newRobotLayer"] = (changed, newLook) => new RobotLayer(view.occlusion, changed, newLook);

@@ -51,6 +51,8 @@ export class Topics {
   private readonly sent = new Map<string, string>();
   private readonly receivers = new Map<string, Receiver>();
   private resizeTimer = 0;
+  /** Whether a headset shows the data, whatever the browser reports about the page. */
+  isPresented = (): boolean => false;
 
   constructor(
     private readonly connection: Connection,
@@ -86,7 +88,7 @@ export class Topics {
     if (!this.connection.isOpen || !this.connection.supports("subscribe")) return;
     for (const topic of this.topics) {
       if (!this.isSupported(topic)) continue;
-      for (const subscription of topic.subscriptions(document.hidden)) {
+      for (const subscription of topic.subscriptions(document.hidden && !this.isPresented())) {
         const message: SubscribeMessage = { type: "subscribe", topic: topic.name, ...subscription };
         const json = JSON.stringify(message);
         const key = `${topic.name} ${message.camera ?? ""}`;

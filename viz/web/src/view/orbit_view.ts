@@ -30,9 +30,11 @@ import { RobotLayer } from "../layers/robot_layer";
 import { ScanLayer } from "../layers/scan_layer";
 import { SceneViews } from "./scene_views";
 import type { ServerClock } from "../connection/server_clock";
+import type { SplatEyes } from "../layers/splat_layer";
+import type { EyeOptions, LentView } from "./lent_view";
 import { cameraAlong, viewOfCamera } from "./view_request";
 import type { ViewMode, ViewState } from "./view_state";
-import { turnControls } from "./up_axis";
+import { turnControls, uprightRotation } from "./up_axis";
 import { listenToViewKeys } from "./view_keys";
 import { viewRenderer } from "./view_renderer";
 import type { ViewTool } from "./view_tool";
@@ -91,6 +93,10 @@ export class OrbitView {
   private isModelShown = true;
   /** Whether another direction than the server's points up. */
   private isTurned = false;
+  /** The view of a headset that draws instead of the page; null if the page draws. */
+  private headView: (() => View) | null = null;
+  /** Whether a headset draws the model with pictures of its own. */
+  private hasOwnPictures = false;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
@@ -332,7 +338,7 @@ export class OrbitView {
 
   /** Adopts newer knowledge of the model's surfaces, and returns to the front of them if the eye has passed one. */
   see(name: string, map: DepthMap): void {
-    this.motion.see(name, map);
+    if (!this.headView) this.motion.see(name, map);
   }
 
   /** Adopts the depth of a new picture. */
@@ -362,7 +368,7 @@ export class OrbitView {
   /** Whether the user moves the eye in a model of which only pictures show the surfaces. */
   get usesSurroundings(): boolean {
     const isMesh = this.local.root.visible && this.local.hasDepth;
-    const isSolid = this.isModelShown && !this.isCut;
+    const isSolid = this.isModelShown && !this.isCut && !this.headView;
     return isSolid && this.picture.posedDepth !== null && !this.attachment.isOn && !isMesh;
   }
 
@@ -447,8 +453,9 @@ export class OrbitView {
     this.hasUserMoved = true;
   }
 
-  /** The current view. */
+  /** The current view: that of the page, or of the headset that draws instead of the page. */
   view(): View {
+    if (this.headView) return this.headView();
     const scale = Math.min(1, this.maxPictureWidthPx / this.canvas.width);
     const size_px: [number, number] = [
       Math.max(1, Math.round(this.canvas.width * scale)),
@@ -468,6 +475,11 @@ export class OrbitView {
     return 0.9 * this.camera.far;
   }
 
+  /** Whether the server's pictures are not needed for the current view. */
+  get replacesPictures(): boolean {
+    return this.local.replacesPictures || this.hasOwnPictures;
+  }
+
   /** Whether the model is drawn. */
   set showsModel(shown: boolean) {
     this.isModelShown = shown;
@@ -484,6 +496,7 @@ export class OrbitView {
    * with other programs.
    */
   draw(): void {
+    if (this.headView) return;
     this.fly.update();
     this.motion.moveBack();
     this.attachment.update();
@@ -508,10 +521,7 @@ export class OrbitView {
     for (const tool of this.tools) tool.update();
     this.robot.fadeNear(this.camera.position);
     this.arrow = arrowPlace(this.sceneViews.robotBox(), this.camera, [this.canvas.clientWidth, this.canvas.clientHeight]);
-    if (this.frames.isVisible) {
-      const cameras = this.overlays.cameraPoses().map(([name, posed]) => [`camera ${name}`, posed] as const);
-      this.frames.update(new Map([...this.robot.linkPoses(), ...cameras]), this.camera);
-    }
+    if (this.frames.isVisible) this.updateFrames();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
     if (!hasDepthBuffer || !this.occlusion.enabled) this.renderer.clearDepth();
@@ -537,7 +547,69 @@ export class OrbitView {
     };
   }
 
+  /** Lends everything that is drawn to a headset, whose view replaces that of the page. */
+  lend(headView: () => View): LentView {
+    const roots = this.lentRoots;
+    const parents = roots.map(({ parent }) => parent!);
+    const worldFromCamera = this.view().world_from_camera;
+    this.headView = headView;
+    this.overlays.writesDepth = true;
+    return {
+      renderer: this.renderer,
+      roots,
+      worldFromCamera,
+      scene: this.scene,
+      worldFromUpright: uprightRotation(this.controls.object.up),
+      background: new THREE.Color(...BACKGROUND),
+      crop: this.crop,
+      robot: this.robot,
+      overlays: this.overlays,
+      canDrawModel: () => this.local.isShown,
+      showsModel: () => this.isModelShown,
+      prepare: (view, eyes, options) => this.prepareEyes(view, eyes, options),
+      end: () => {
+        this.headView = null;
+        this.hasOwnPictures = false;
+        this.picture.hidesEmpty = false;
+        this.overlays.writesDepth = false;
+        for (const [ix, root] of roots.entries()) parents[ix]!.add(root);
+        this.fit();
+        this.onMove();
+      },
+    };
+  }
+
+  private get lentRoots(): THREE.Object3D[] {
+    const layers = [this.overlays, this.robot, this.points, this.scans, this.frames, this.crop, ...this.tools];
+    return [this.local.root, this.picture.mesh, ...layers.map(({ root }) => root)];
+  }
+
+  private prepareEyes(view: View, eyes: SplatEyes, options: EyeOptions): ReturnType<LentView["prepare"]> {
+    this.hasOwnPictures = options.hasOwnPictures;
+    this.picture.hidesEmpty = options.hasPassthrough;
+    const head = worldFromCamera(view.world_from_camera);
+    this.picture.setView(head);
+    this.local.root.visible = this.isModelShown;
+    this.local.crop = view.crop;
+    this.local.setView(view, view.size_px, false, eyes);
+    const isLocal = this.local.isShown && !options.hasOwnPictures;
+    this.local.root.visible = this.isModelShown && isLocal;
+    this.picture.enabled = this.isModelShown && !isLocal && !options.hasOwnPictures;
+    // The depth buffer holds the model, so that it and all bodies hide each other.
+    this.occlusion.usesDepthBuffer = true;
+    this.occlusion.local = null;
+    this.robot.fadeNear(new THREE.Vector3().setFromMatrixPosition(head));
+    if (this.frames.isVisible) this.updateFrames();
+    return this.local.root.visible ? "local" : this.picture.mesh.visible ? "pictures" : "nothing";
+  }
+
+  private updateFrames(): void {
+    const cameras = this.overlays.cameraPoses().map(([name, posed]) => [`camera ${name}`, posed] as const);
+    this.frames.update(new Map([...this.robot.linkPoses(), ...cameras]), this.camera);
+  }
+
   private fit(): void {
+    if (this.headView) return; // The renderer has the size of the headset.
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(1, clientHeight);
