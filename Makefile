@@ -34,7 +34,7 @@ PORT = 7007
 # Without a GPU, a run corrects the calibration only if that is requested, because it takes time from training. This rig shows it.
 REFINE = $(if $(filter uncalibrated,$(RIG)),--refine auto)
 # The arms of these rigs can be steered from the page.
-MOTION = $(if $(filter static-arm static-arm-720p two-cameras uncalibrated,$(RIG)),--enable-motion)
+MOTION = $(if $(filter static-arm static-arm-720p two-cameras uncalibrated mobile-arm mobile-base mobile-base-small,$(RIG)),--enable-motion)
 # Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 

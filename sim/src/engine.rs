@@ -16,7 +16,7 @@ use crate::optics::{Optics, RowMotion};
 use crate::random::RandomStream;
 use crate::render::{Pending, Renderer};
 use crate::robot::{Robot, RobotPose};
-use crate::steered_base::BaseWay;
+use crate::steered_base::BasePath;
 use crate::{Error, render};
 use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, TruthImage};
 use kinematics::{JointState, Stamp, Transform};
@@ -377,12 +377,12 @@ impl Engine {
         Ok(())
     }
 
-    /// Lets an operator take the base over from its tour. Returns the way of the base. `start` is
+    /// Lets an operator take the base over from its tour. Returns the path of the base. `start` is
     /// simulated time zero on the clock of the thread that drives it.
-    pub(crate) fn steer_base(&mut self, start: Stamp) -> BaseWay {
-        let way = BaseWay::new(start, *self.robot.motion());
-        self.robot.steer_base(way.clone());
-        way
+    pub(crate) fn steer_base(&mut self, start: Stamp) -> BasePath {
+        let path = BasePath::new(start, *self.robot.motion());
+        self.robot.steer_base(path.clone());
+        path
     }
 
     /// Counts contacts while commands move the arm or the base, if there is a counter.

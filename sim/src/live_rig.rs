@@ -46,10 +46,12 @@ pub struct LiveRig {
     pub info: RigInfo,
 }
 
-/// Simulated devices in real time, with a base that an operator may drive.
+/// Simulated devices in real time, with a base that an operator may drive, and its arm.
 pub struct SteeredBaseRig {
     /// The devices.
     pub live: LiveRig,
+    /// The arm on the base, if it is steered, too.
+    pub arm: Option<SteeredArm>,
     /// The base, for the program.
     pub base: SteeredBase,
     /// The base, for the thread that drives it.
@@ -161,19 +163,41 @@ impl LiveRig {
     }
 
     /// Starts a rig whose base an operator may take over from its tour.
+    ///
+    /// * `limits`: those of the arm on the base, if the operator may take it over, too.
     pub(crate) fn start_with_steered_base(
         (mut engine, contacts): (Engine, Option<ContactCounter>),
         info: RigInfo,
+        limits: Option<SteeredLimits<'_>>,
     ) -> Result<SteeredBaseRig, Error> {
-        let start = drivers::clock::now();
-        let started = Instant::now();
-        let way = engine.steer_base(start);
+        let handover = Handover::default();
+        let position = match limits {
+            Some(_) => {
+                let position = engine.reported_joints()?;
+                engine.hand_over_to(handover.clone())?;
+                position
+            }
+            None => Vec::new(),
+        };
         let n_contacts = contacts.as_ref().map(ContactCounter::n_contacts);
         engine.count_contacts(contacts);
+        let start = drivers::clock::now();
+        let started = Instant::now();
+        let path = engine.steer_base(start);
+        let (controller, arm) = match limits {
+            Some(limits) => {
+                let counted = n_contacts.clone();
+                let (controller, arm) =
+                    Controller::start(limits, &position, handover, started, counted)?;
+                (Some(controller), Some(arm))
+            }
+            None => (None, None),
+        };
         Ok(SteeredBaseRig {
-            driven: way.driven(),
-            live: Self::start_with(engine, info, start, started, None)?,
-            base: SteeredBase::new(way, n_contacts),
+            driven: path.driven(),
+            live: Self::start_with(engine, info, start, started, controller)?,
+            arm,
+            base: SteeredBase::new(path, n_contacts),
             start,
         })
     }

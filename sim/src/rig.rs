@@ -345,12 +345,17 @@ impl Rig {
 
     /// Lets the rig run in real time, with a base that an operator may take over from its tour.
     ///
+    /// * `limits`: those of the arm on the base, if the operator may take it over, too.
+    ///
     /// # Errors
     ///
-    /// If a thread cannot be started.
-    pub fn into_steered_base(self) -> Result<SteeredBaseRig, Error> {
+    /// If the arm is outside its limits, or a thread cannot be started.
+    pub fn into_steered_base(
+        self,
+        limits: Option<SteeredLimits<'_>>,
+    ) -> Result<SteeredBaseRig, Error> {
         let contacts = contact_counter(self.build_contacts);
-        LiveRig::start_with_steered_base((self.engine, contacts), self.info)
+        LiveRig::start_with_steered_base((self.engine, contacts), self.info, limits)
     }
 
     /// Lets the rig run in real time. Simulated time zero is the time of this call, which is

@@ -6,7 +6,7 @@ use crate::base::{BaseMotion, LAP_M};
 use crate::joints::Joints;
 use crate::motors::MotorizedArm;
 use crate::panda;
-use crate::steered_base::BaseWay;
+use crate::steered_base::BasePath;
 use crate::twin::TwinModel;
 use kinematics::Transform;
 use std::sync::Arc;
@@ -76,8 +76,8 @@ enum ArmMotion {
 pub(crate) struct Robot {
     arm: Option<ArmMotion>,
     motion: BaseMotion,
-    /// The way of the base after its tour, if an operator may drive it.
-    way: Option<BaseWay>,
+    /// The path of the base after its tour, if an operator may drive it.
+    path: Option<BasePath>,
     kinematics: RobotKinematics,
     n_steps: i64,
 }
@@ -88,7 +88,7 @@ impl Robot {
         Self {
             arm,
             motion,
-            way: None,
+            path: None,
             kinematics,
             n_steps: 0,
         }
@@ -100,22 +100,25 @@ impl Robot {
     }
 
     /// Lets an operator take the base over from its tour.
-    pub(crate) fn steer_base(&mut self, way: BaseWay) {
-        self.way = Some(way);
+    pub(crate) fn steer_base(&mut self, path: BasePath) {
+        self.path = Some(path);
     }
 
     /// True pose of the base at a time, nanoseconds.
     pub(crate) fn world_from_base(&self, nanos: i64) -> Transform {
-        let steered = self.way.as_ref().and_then(|way| way.world_from_base(nanos));
+        let steered = self
+            .path
+            .as_ref()
+            .and_then(|path| path.world_from_base(nanos));
         steered.unwrap_or_else(|| self.motion.world_from_base(nanos as f64 * 1e-9))
     }
 
     /// Completed fraction of the walk. The reported pose drifts with it.
     pub(crate) fn walked_frac(&self, nanos: i64) -> f64 {
         let steered = self
-            .way
+            .path
             .as_ref()
-            .and_then(|way| way.walked_frac(nanos, LAP_M));
+            .and_then(|path| path.walked_frac(nanos, LAP_M));
         steered.unwrap_or_else(|| self.motion.walked_frac(nanos as f64 * 1e-9))
     }
 
@@ -130,7 +133,7 @@ impl Robot {
     /// Whether a client or an operator commands the arm or the base. Commands may come at any time.
     pub(crate) fn is_commanded(&self) -> bool {
         matches!(&self.arm, Some(ArmMotion::Simulated(arm)) if arm.is_commanded())
-            || self.way.as_ref().is_some_and(BaseWay::has_begun)
+            || self.path.as_ref().is_some_and(BasePath::has_begun)
     }
 
     /// Replaces the arm by one that emulated motors move.
@@ -144,8 +147,8 @@ impl Robot {
     pub(crate) fn step(&mut self) -> Result<(i64, Option<JointReading>), Error> {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
-        if let Some(way) = &self.way {
-            way.step(nanos);
+        if let Some(path) = &self.path {
+            path.step(nanos);
         }
         let reading = match &mut self.arm {
             Some(ArmMotion::Simulated(arm)) => Some(arm.step()),

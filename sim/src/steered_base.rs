@@ -2,7 +2,7 @@
 //!
 //! Until the operator begins, the base moves on its tour. It then brakes, and follows the
 //! velocities of the thread that drives it, in real time. The thread of the simulation may lag
-//! behind, because it renders: it follows the same way when it gets there.
+//! behind, because it renders: it follows the same path when it gets there.
 
 use crate::base::{BaseMotion, smooth};
 use drivers::base_motion::{BaseReport, BaseVelocity, MovableBase};
@@ -19,7 +19,7 @@ const VALID_NANOS: i64 = 100_000_000;
 /// Number of velocities that are kept for the simulation: those of two minutes. A simulation that
 /// is later than this has stopped.
 const MAX_LEGS: usize = 6000;
-/// Time for which the past way is kept, because cameras and scanners may still need it,
+/// Time for which the past path is kept, because cameras and scanners may still need it,
 /// nanoseconds.
 const PAST_NANOS: i64 = 5_000_000_000;
 /// Maximum time to wait for a velocity, after which the base counts as abandoned and stands still.
@@ -32,26 +32,26 @@ const LEVEL_NANOS: f64 = 1e9;
 /// A simulated base that an operator may drive. Clones refer to the same base.
 #[derive(Clone, Debug)]
 pub struct SteeredBase {
-    way: BaseWay,
+    path: BasePath,
     n_contacts: Option<Arc<AtomicU64>>,
 }
 
 impl SteeredBase {
-    pub(crate) fn new(way: BaseWay, n_contacts: Option<Arc<AtomicU64>>) -> Self {
-        Self { way, n_contacts }
+    pub(crate) fn new(path: BasePath, n_contacts: Option<Arc<AtomicU64>>) -> Self {
+        Self { path, n_contacts }
     }
 
     /// Ends the tour: the base brakes, and then follows velocities.
     pub fn begin(&self) {
-        self.way.0.state.lock().is_wanted = true;
+        self.path.0.state.lock().is_wanted = true;
     }
 
     /// True pose of the base at a time, on the clock of the thread that drives it.
     #[must_use]
     pub fn world_from_base(&self, at: Stamp) -> Transform {
-        let Shared { start, tour, .. } = &*self.way.0;
+        let Shared { start, tour, .. } = &*self.path.0;
         let nanos = at.nanos_since(*start);
-        let steered = self.way.world_from_base(nanos);
+        let steered = self.path.world_from_base(nanos);
         steered.unwrap_or_else(|| tour.world_from_base(nanos as f64 * 1e-9))
     }
 
@@ -63,10 +63,10 @@ impl SteeredBase {
     }
 }
 
-/// The way of a base, shared by the simulation and the thread that drives the base. Times are
+/// The path of a base, shared by the simulation and the thread that drives the base. Times are
 /// simulated nanoseconds.
 #[derive(Clone, Debug)]
-pub(crate) struct BaseWay(Arc<Shared>);
+pub(crate) struct BasePath(Arc<Shared>);
 
 #[derive(Debug)]
 struct Shared {
@@ -84,7 +84,7 @@ struct State {
     simulated_nanos: i64,
     /// The end of the tour.
     tour_end: Option<TourEnd>,
-    /// The way since then, in the order of time.
+    /// The path since then, in the order of time.
     legs: VecDeque<Leg>,
     /// Whether nobody drives the base any more.
     is_abandoned: bool,
@@ -100,14 +100,14 @@ struct TourEnd {
     walked_frac: f64,
 }
 
-/// A part of the way with one velocity.
+/// A part of the path with one velocity.
 #[derive(Clone, Copy, Debug)]
 struct Leg {
     nanos: i64,
     /// x, y in meters and heading in radians, at the start.
     place: [f64; 3],
     velocity: BaseVelocity,
-    /// Length of the way since the end of the tour, meters.
+    /// Length of the path since the end of the tour, meters.
     walked_m: f64,
 }
 
@@ -118,7 +118,7 @@ impl Leg {
         let secs = lasted_nanos as f64 * 1e-9;
         let [x, y, yaw] = self.place;
         let turned = self.velocity.yaw_rad_s * secs;
-        // The way at constant velocities is an arc, whose chord points in the direction at half of
+        // The path at constant velocities is an arc, whose chord points in the direction at half of
         // the turn. The chord is shorter than the arc by the sinc of half of the turn.
         let (sin, cos) = (yaw + 0.5 * turned).sin_cos();
         let half = 0.5 * turned;
@@ -146,7 +146,7 @@ impl Leg {
     }
 }
 
-impl BaseWay {
+impl BasePath {
     /// A base on its tour.
     ///
     /// * `start`: simulated time zero on the clock of the thread that drives the base.
@@ -164,7 +164,7 @@ impl BaseWay {
         Box::new(DrivenBase(self.clone()))
     }
 
-    /// For the simulation: the robot steps to a time. Waits until the way to this time is known.
+    /// For the simulation: the robot steps to a time. Waits until the path to this time is known.
     pub(crate) fn step(&self, nanos: i64) {
         let mut state = self.0.state.lock();
         state.simulated_nanos = nanos;
@@ -277,7 +277,7 @@ fn place_of(world_from_base: &Transform) -> [f64; 3] {
 }
 
 /// The side of the thread that drives the base. Dropping it leaves the base where it is.
-struct DrivenBase(BaseWay);
+struct DrivenBase(BasePath);
 
 impl DrivenBase {
     fn simulated(&self, now: Stamp) -> i64 {
@@ -360,28 +360,28 @@ mod tests {
     }
 
     /// A base that is taken over at a time of its tour, and the thread that drives it.
-    fn taken_over(tour: BaseMotion, nanos: i64) -> (BaseWay, Box<dyn MovableBase>) {
-        let way = BaseWay::new(START, tour);
-        let base = SteeredBase::new(way.clone(), None);
-        let mut driven = way.driven();
-        way.step(nanos - STEP_NANOS);
+    fn taken_over(tour: BaseMotion, nanos: i64) -> (BasePath, Box<dyn MovableBase>) {
+        let path = BasePath::new(START, tour);
+        let base = SteeredBase::new(path.clone(), None);
+        let mut driven = path.driven();
+        path.step(nanos - STEP_NANOS);
         assert!(driven.report(stamp(nanos - STEP_NANOS)).is_on_tour);
         base.begin();
         assert!(!driven.report(stamp(nanos)).is_on_tour);
-        assert!(way.has_begun());
-        (way, driven)
+        assert!(path.has_begun());
+        (path, driven)
     }
 
     #[test]
     fn what_was_simulated_ahead_of_real_time_stays_as_it_was() {
-        let way = BaseWay::new(START, BaseMotion::Lap(1.0));
-        let mut driven = way.driven();
-        way.step(7_000_000_000);
-        SteeredBase::new(way.clone(), None).begin();
+        let path = BasePath::new(START, BaseMotion::Lap(1.0));
+        let mut driven = path.driven();
+        path.step(7_000_000_000);
+        SteeredBase::new(path.clone(), None).begin();
         let report = driven.report(stamp(6_800_000_000));
         assert!(report.is_on_tour && !report.is_stop_confirmed, "{report:?}");
-        assert_eq!(way.world_from_base(7_000_000_000), None);
-        let base = SteeredBase::new(way.clone(), None);
+        assert_eq!(path.world_from_base(7_000_000_000), None);
+        let base = SteeredBase::new(path.clone(), None);
         let tour = BaseMotion::Lap(1.0);
         let at_start = base.world_from_base(stamp(6_900_000_000));
         assert_eq!(at_start, tour.world_from_base(6.9));
@@ -392,10 +392,10 @@ mod tests {
     }
 
     #[test]
-    fn the_way_continues_from_the_tour_without_a_jump_and_ends_level() {
+    fn the_path_continues_from_the_tour_without_a_jump_and_ends_level() {
         let tour = BaseMotion::Lap(1.0);
         let began_nanos = 7_000_000_000;
-        let (way, mut driven) = taken_over(tour, began_nanos);
+        let (path, mut driven) = taken_over(tour, began_nanos);
         let velocity = driven.report(stamp(began_nanos + 1)).velocity;
         assert!(velocity.speed_m_s() > 0.2, "{velocity:?}");
         let mut before = tour.world_from_base(began_nanos as f64 * 1e-9);
@@ -406,8 +406,8 @@ mod tests {
             let braked = velocity.to_array().map(|number| number * left);
             let driven = driven.drive(stamp(nanos), &BaseVelocity::from_array(braked));
             driven.expect("a simulated base is always reached");
-            way.step(nanos);
-            let pose = way.world_from_base(nanos).expect("after the tour");
+            path.step(nanos);
+            let pose = path.world_from_base(nanos).expect("after the tour");
             let moved_m = (pose.translation.vector - before.translation.vector).norm();
             assert!(moved_m < 0.03, "{moved_m} m in 20 ms");
             before = pose;
@@ -417,14 +417,14 @@ mod tests {
         assert!((before.translation.z - tour.rest_z_m()).abs() < 1e-12);
         assert!(driven.report(stamp(9_100_000_000)).is_stop_confirmed);
         let tour_m = 14.0;
-        let walked = way.walked_frac(9_000_000_000, tour_m).expect("known");
+        let walked = path.walked_frac(9_000_000_000, tour_m).expect("known");
         assert!(walked > tour.walked_frac(7.0), "the drift goes on");
     }
 
     #[test]
     fn velocities_move_the_base_along_arcs_and_end_without_newer_ones() {
         let tour = BaseMotion::FixedAt(Transform::identity());
-        let (way, mut driven) = taken_over(tour, 1_000_000_000);
+        let (path, mut driven) = taken_over(tour, 1_000_000_000);
         let quarter = std::f64::consts::FRAC_PI_2;
         let velocity = BaseVelocity {
             forward_m_s: quarter,
@@ -438,14 +438,14 @@ mod tests {
             result.expect("a simulated base is always reached");
         }
         // A second on a circle with a radius of 1 m, from the first of these velocities on.
-        let pose = way.world_from_base(nanos).expect("after the tour");
+        let pose = path.world_from_base(nanos).expect("after the tour");
         let [x, y, yaw] = place_of(&pose);
         assert!((x - 1.0).abs() < 1e-9 && (y - 1.0).abs() < 1e-9, "{x} {y}");
         assert!((yaw - quarter).abs() < 1e-9, "{yaw}");
         // Nobody drives it for a second: it moved on for 100 ms.
         drop(driven);
-        way.step(nanos + 1_000_000_000);
-        let pose = way.world_from_base(nanos + 1_000_000_000).expect("known");
+        path.step(nanos + 1_000_000_000);
+        let pose = path.world_from_base(nanos + 1_000_000_000).expect("known");
         let [x, y, _] = place_of(&pose);
         let moved_m = (x - 1.0).hypot(y - 1.0);
         assert!((moved_m - 0.1 * quarter).abs() < 1e-3, "{moved_m}");
@@ -486,7 +486,7 @@ mod tests {
         config.cameras[0].parent = Parent::Base;
         config.cameras[0].intrinsics = config.cameras[0].intrinsics.resized([160, 120]);
         let rig = crate::open(&config).expect("the rig opens");
-        let rig = rig.into_steered_base().expect("the rig starts");
+        let rig = rig.into_steered_base(None).expect("the rig starts");
         let mut poses = rig.live.devices.base.expect("it moves");
         let drive = BaseDrive::start(rig.driven, LIMITS).expect("valid limits");
         let began = Instant::now();
@@ -504,7 +504,7 @@ mod tests {
             assert!(began.elapsed() < TIMEOUT, "{:?}", drive.port().state());
             std::thread::sleep(Duration::from_millis(5));
         }
-        // Poses of the rig may still be on their way.
+        // Poses of the rig may still be on their path.
         let mut rest = newest_place(&mut poses);
         loop {
             let next = newest_place(&mut poses);

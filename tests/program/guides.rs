@@ -126,6 +126,7 @@ const ONLY_PARSED: [(&str, &[&str]); 10] = [
             "run board.toml --sim",
             "run calibrated.toml --sim",
             "run my-robot.toml --sim",
+            "run rigs/mobile-arm.toml --sim --enable-motion",
             "run rigs/mobile-base.toml --sim --enable-motion",
             "run rigs/static-arm.toml --sim",
             "train scan.mcap",

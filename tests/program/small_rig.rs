@@ -44,9 +44,32 @@ pub(crate) fn write_base(folder: &Path) {
     // Corrections of the map would look like motions of the base.
     let base = rig["base"].as_table_mut().expect("a base");
     base.insert("realign".into(), false.into());
+    // Without the scanner, nothing sees the space around the base.
+    let motion = base["motion"].as_table_mut().expect("it is driven");
+    motion.insert("allow_unseen".into(), true.into());
     let cameras = rig["camera"].as_table_mut().expect("cameras");
     cameras.remove("rear");
     shrink(cameras["front"].as_table_mut().expect("a camera"));
+    let sim = rig["sim"].as_table_mut().expect("a simulation");
+    sim.insert("ideal".into(), true.into());
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");
+}
+
+/// Writes `rig.toml` into a folder: `rigs/mobile-arm.toml` with small images, without sensor
+/// imperfections, and the files it refers to.
+pub(crate) fn write_mobile_arm(folder: &Path) {
+    let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let mut rig = shipped(&rigs, "mobile-arm.toml");
+    copy_urdf(&rigs, folder, &rig);
+    let base = rig["base"].as_table_mut().expect("a base");
+    base.insert("realign".into(), false.into());
+    // The wrist camera sees little of the space around the base.
+    let motion = base["motion"].as_table_mut().expect("it is driven");
+    motion.insert("allow_unseen".into(), true.into());
+    let cameras = rig["camera"].as_table_mut().expect("cameras");
+    let wrist = cameras["wrist"].as_table_mut().expect("a camera");
+    shrink(wrist);
+    shrink(wrist["depth"].as_table_mut().expect("it has depth"));
     let sim = rig["sim"].as_table_mut().expect("a simulation");
     sim.insert("ideal".into(), true.into());
     std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");

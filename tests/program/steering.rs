@@ -1,6 +1,7 @@
 //! A client of `/steer` moves the simulated arm of `fieldrig run`, and viewers see it.
 
 use crate::small_rig::{self, Pace};
+use crate::steering_client::{Operator, TIMEOUT, numbers};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -9,10 +10,6 @@ use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
 
-/// Maximum time until an event, on a machine that is busy with other tests.
-const TIMEOUT: Duration = Duration::from_secs(300);
-/// Time between two commands of the client: those of a page with 40 pictures per second.
-const COMMAND_PERIOD: Duration = Duration::from_millis(25);
 /// How far the tip moves, meters.
 const DISTANCE_M: f64 = 0.1;
 /// How far a joint may be from its goal when the arm has arrived, radians. The simulated arm follows
@@ -106,123 +103,8 @@ impl Run {
     }
 }
 
-/// A page that steers.
-struct Operator {
-    socket: WebSocket<TcpStream>,
-    client: u64,
-    sequence: u64,
-    grip: u64,
-    /// The newest state, and when it came.
-    state: Value,
-    state_at: Instant,
-}
-
-impl Operator {
-    /// Connects as soon as the arm is open.
-    fn connect(run: &Run) -> Self {
-        let began = Instant::now();
-        let socket = loop {
-            if let Some(socket) = run.connect("/steer") {
-                break socket;
-            }
-            assert!(
-                began.elapsed() < TIMEOUT,
-                "the arm is not open within {TIMEOUT:?}"
-            );
-            std::thread::sleep(Duration::from_millis(100));
-        };
-        let mut operator = Self {
-            socket,
-            client: 0,
-            sequence: 0,
-            grip: 1,
-            state: Value::Null,
-            state_at: Instant::now(),
-        };
-        let arm = operator.read_until(|message| message["type"] == "arm");
-        assert_eq!(arm["may_steer"], true, "{arm}");
-        assert_eq!(arm["joints"].as_array().map(Vec::len), Some(7), "{arm}");
-        operator.client = arm["client"].as_u64().expect("a number");
-        operator
-    }
-
-    fn send(&mut self, message: Value) {
-        let message = Message::text(message.to_string());
-        self.socket.send(message).expect("the server reads");
-    }
-
-    /// Reads messages until one is accepted.
-    fn read_until(&mut self, accepts: impl Fn(&Value) -> bool) -> Value {
-        let began = Instant::now();
-        loop {
-            assert!(began.elapsed() < TIMEOUT, "last state: {}", self.state);
-            let Message::Text(text) = self.socket.read().expect("the server sends") else {
-                continue;
-            };
-            let message: Value = serde_json::from_str(&text).expect("JSON");
-            if message["type"] == "state" {
-                self.state = message.clone();
-                self.state_at = Instant::now();
-            }
-            if accepts(&message) {
-                return message;
-            }
-        }
-    }
-
-    fn next_state(&mut self) -> Value {
-        self.read_until(|message| message["type"] == "state")
-    }
-
-    /// Sends a command, whose device was read now.
-    fn command(&mut self, grip: Option<u64>, position: &[f64]) {
-        self.sequence += 1;
-        let state_micros = self.state["time_micros"].as_f64().expect("a number");
-        let since = self.state_at.elapsed().as_secs_f64();
-        self.send(json!({
-            "type": "command",
-            "device": 1,
-            "sequence": self.sequence,
-            "captured_micros": state_micros + 1e6 * since,
-            "grip": grip,
-            "intent": {"kind": "joints", "position": position},
-        }));
-    }
-
-    /// Holds the switch until the arm is at a position. A pause of this program lets the arm brake,
-    /// so the operator grips again whenever the arm does not follow.
-    fn move_to(&mut self, position: &[f64]) {
-        let began = Instant::now();
-        let mut n_unfollowed = 0;
-        loop {
-            assert!(began.elapsed() < TIMEOUT, "last state: {}", self.state);
-            self.command(Some(self.grip), position);
-            let state = self.next_state();
-            if distance(&numbers(&state["position"]), position) < ARRIVED_RAD {
-                return;
-            }
-            n_unfollowed = if state["target"].is_null() {
-                n_unfollowed + 1
-            } else {
-                0
-            };
-            if n_unfollowed > 20 {
-                self.command(None, position);
-                self.grip += 1;
-                n_unfollowed = 0;
-            }
-            std::thread::sleep(COMMAND_PERIOD);
-        }
-    }
-}
-
-pub(crate) fn numbers(value: &Value) -> Vec<f64> {
-    let list = value
-        .as_array()
-        .unwrap_or_else(|| panic!("no list: {value}"));
-    list.iter()
-        .map(|number| number.as_f64().expect("a number"))
-        .collect()
+fn joints(position: &[f64]) -> Value {
+    json!({"kind": "joints", "position": position})
 }
 
 /// Largest difference.
@@ -270,19 +152,22 @@ fn an_operator_takes_the_simulated_arm_over_and_moves_its_tip_back_by_ten_centim
         way.push(operator.next_state());
     }
     let client = operator.client;
-    operator.send(json!({"type": "lease", "action": "take"}));
+    operator.send(&json!({"type": "lease", "action": "take"}));
     operator.read_until(|message| message["holder"] == client && message["is_moving"] == false);
     let start = operator.state.clone();
 
     // A device is first heard with an open switch.
     let rest = numbers(&start["position"]);
-    operator.command(None, &rest);
+    operator.release(&joints(&rest));
     let mut goal = start.clone();
     while tip_distance_m(&start, &goal) < DISTANCE_M {
         goal = way.pop().expect("the way is longer");
-        operator.move_to(&numbers(&goal["position"]));
+        let position = numbers(&goal["position"]);
+        operator.hold_until(&joints(&position), |operator| {
+            distance(&numbers(&operator.state["position"]), &position) < ARRIVED_RAD
+        });
     }
-    operator.command(None, &rest);
+    operator.release(&joints(&rest));
     let left = operator.read_until(|message| {
         message["type"] == "state" && message["is_moving"] == false && message["target"].is_null()
     });
@@ -400,10 +285,10 @@ fn a_killed_run_leaves_a_log_up_to_its_stop() {
     let run = Run::start(folder.path(), &["--enable-motion"]);
     let mut operator = Operator::connect(&run);
     let client = operator.client;
-    operator.send(json!({"type": "lease", "action": "take"}));
+    operator.send(&json!({"type": "lease", "action": "take"}));
     operator.read_until(|message| message["holder"] == client);
-    operator.send(json!({"type": "view", "world_from_camera": [1, 0, 2, 0, 0, 0, 1]}));
-    operator.send(json!({"type": "stop"}));
+    operator.send(&json!({"type": "view", "world_from_camera": [1, 0, 2, 0, 0, 0, 1]}));
+    operator.send(&json!({"type": "stop"}));
     operator.read_until(|message| message["stop"].is_string());
     // Several further decisions, so that the thread of the log has had time. It does not wait for
     // anything.

@@ -44,14 +44,15 @@ pub use server::certificate::Certificate;
 pub use server::downloads::{OpenFile, ServedFile, publish_files};
 pub use server::served_page::{CertificateSource, PageOptions, ServedPage};
 pub use server::{Server, ServerConfig, ServerThread, Sharing};
-pub use steering::arm_description::{ArmDescription, BaseDescription, SteeredJoint};
+pub use steering::arm_description::{ArmDescription, BaseAvoidance, BaseDescription, SteeredJoint};
 pub use steering::preview::{Preview, PreviewVerdict};
 pub use steering::request::{
     PreviewGoal, PreviewRequest, ReceivedRequest, RefusedRequest, SteeringCommand, SteeringIntent,
     SteeringRequest,
 };
 pub use steering::state::{
-    AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeredBaseState, SteeringState,
+    AppliedCommand, AppliedLimit, LimitEffect, LimitLink, SteeredBaseState, SteeredPart,
+    SteeringState,
 };
 pub use steering::steering_server::{SteeringServer, publish_steering};
 pub use topics::edit_status::{ErasedBox, LastEdit, SavedEdits};

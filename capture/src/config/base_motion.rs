@@ -34,6 +34,23 @@ keys! {
         pub stowed: Vec<f64> = Vec::new();
         /// Largest distance of each joint from its stowed position, radians or meters.
         pub stowed_tolerance: f64 = 0.1, in 0.001..=1.0;
+        /// Radius of a circle around the base link, m, in which the robot is while the base moves.
+        /// Without this key and `footprint_m`, the footprint encloses the shapes of the robot
+        /// description.
+        pub footprint_radius_m: Option<f64>, in 0.05..=3.0;
+        /// Corners of a convex polygon around the robot while the base moves, m: x and y of each
+        /// corner, one after the other, in the frame of the base link.
+        pub footprint_m: Vec<f64> = Vec::new();
+        /// Lowest and highest height of obstacles, m, in the frame of the base link. The lowest one
+        /// must be above the floor. Without this key, obstacles are at the height of the robot,
+        /// except for its lowest 0.1 m.
+        pub footprint_height_m: Option<[f64; 2]>, in -5.0..=5.0;
+        /// Whether the base may enter space that no depth camera or range scanner has seen.
+        pub allow_unseen: bool = false;
+        /// Distance around the footprint, m, up to which space that nothing has seen counts as free
+        /// where the base was before the first operator took it over. A simulated base uses at least
+        /// 0.15.
+        pub swept_margin_m: f64 = 0.0, in 0.0..=0.2;
     }
 }
 
@@ -51,6 +68,11 @@ impl Default for BaseMotion {
             area_m: None,
             stowed: Vec::new(),
             stowed_tolerance: 0.1,
+            footprint_radius_m: None,
+            footprint_m: Vec::new(),
+            footprint_height_m: None,
+            allow_unseen: false,
+            swept_margin_m: 0.0,
         }
     }
 }
@@ -68,6 +90,12 @@ impl BaseMotion {
             brake_m_s2: self.brake_m_s2,
             brake_yaw_rad_s2: self.brake_yaw_rad_s2,
         }
+    }
+
+    /// Corners of the footprint; empty if they are not given.
+    #[must_use]
+    pub fn footprint_corners_m(&self) -> Vec<[f64; 2]> {
+        self.footprint_m.as_chunks::<2>().0.to_vec()
     }
 
     /// Checks values that depend on each other.
@@ -97,6 +125,23 @@ impl BaseMotion {
             let reason = format!("it has {n_stowed} positions, the arm has {n_joints} joints");
             return error("base.motion.stowed", reason);
         }
+        let n_numbers = self.footprint_m.len();
+        if n_numbers > 0 && (n_numbers < 6 || !n_numbers.is_multiple_of(2)) {
+            let reason = format!(
+                "it has {n_numbers} numbers: list x and y of at least 3 corners, one after the other"
+            );
+            return error("base.motion.footprint_m", reason);
+        }
+        if n_numbers > 0 && self.footprint_radius_m.is_some() {
+            let reason = "footprint_radius_m is set, too: remove one of them".to_owned();
+            return error("base.motion.footprint_m", reason);
+        }
+        if let Some([low, high]) = self.footprint_height_m
+            && low >= high
+        {
+            let reason = format!("it is from {low} to {high}: list the lowest height first");
+            return error("base.motion.footprint_height_m", reason);
+        }
         Ok(())
     }
 }
@@ -125,6 +170,12 @@ mod tests {
             ("acceleration_m_s2 = 1.0", "brake_m_s2 is 0.6"),
             ("area_m = [0, 1, 2, 1]", "base.motion.area_m: it is from"),
             ("stowed = [0.1]", "it has 1 positions, the arm has 2 joints"),
+            ("footprint_m = [0, 0, 1, 0]", "at least 3 corners"),
+            (
+                "footprint_m = [0, 0, 1, 0, 0, 1]\nfootprint_radius_m = 1",
+                "footprint_radius_m is set, too",
+            ),
+            ("footprint_height_m = [0.2, 0.1]", "the lowest height first"),
         ] {
             let error = read(table).expect_err(table);
             assert!(error.contains(expected), "{error}");

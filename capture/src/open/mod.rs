@@ -19,6 +19,7 @@ mod simulated;
 mod simulated_tests;
 mod steered;
 mod steered_base;
+mod steered_robot;
 #[cfg(all(test, feature = "sim"))]
 mod steered_tests;
 mod tag_check;
@@ -37,8 +38,9 @@ pub use movable::{Movable, movable};
 pub use real::{check_motion, motion_of, movable_arm, udp_arm_address};
 #[cfg(target_os = "linux")]
 pub(crate) use servos::servo_config;
-pub use steered::{SteeredArm, check_steerable, steered};
-pub use steered_base::{SteeredBase, check_drivable, is_base_steered, with_steered_base};
+pub use steered::SteeredArm;
+pub use steered_base::SteeredBase;
+pub use steered_robot::{SteeredRobot, check_steered, with_steered_robot};
 #[cfg(target_os = "linux")]
 pub use ur::arm_config as ur_config;
 

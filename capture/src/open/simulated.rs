@@ -59,15 +59,29 @@ pub(super) fn steered(
     Ok((Box::new(RealTime::new(rig, live, start)?), arm))
 }
 
-/// A simulated base, and the same base for the thread that drives it.
-pub(super) type DrivenBase = (sim::SteeredBase, Box<dyn MovableBase>);
+/// A simulated base, the same base for the thread that drives it, and its arm if it is steered.
+pub(super) struct DrivenRobot {
+    pub(super) base: sim::SteeredBase,
+    pub(super) driven: Box<dyn MovableBase>,
+    pub(super) arm: Option<sim::SteeredArm>,
+}
 
 /// Opens a simulated rig in real time, with a base that an operator may take over from its tour.
 /// Stamps are on the clock of this computer.
-pub(super) fn with_steered_base(rig: &Rig) -> anyhow::Result<(Box<dyn Source>, DrivenBase)> {
-    let opened = sim::open(&without_end(config_of(rig)?))?.into_steered_base()?;
+///
+/// * `limits`: those of the arm on the base, if the operator may take it over, too.
+pub(super) fn with_steered_base(
+    rig: &Rig,
+    limits: Option<sim::SteeredLimits<'_>>,
+) -> anyhow::Result<(Box<dyn Source>, DrivenRobot)> {
+    let opened = sim::open(&without_end(config_of(rig)?))?.into_steered_base(limits)?;
     let source = RealTime::new(rig, opened.live, opened.start)?;
-    Ok((Box::new(source), (opened.base, opened.driven)))
+    let robot = DrivenRobot {
+        base: opened.base,
+        driven: opened.driven,
+        arm: opened.arm,
+    };
+    Ok((Box::new(source), robot))
 }
 
 /// A configuration without limits. In real time, the source checks them itself: if the simulated

@@ -13,7 +13,7 @@ use messages::{BadInput, Setting};
 
 /// Acceleration and jerk of braking, as a factor of those of motions. Drivers keep motions far
 /// below what the robot can do, and an arm that must stop may use more of it.
-const BRAKE_FACTOR: f64 = 2.0;
+pub(super) const BRAKE_FACTOR: f64 = 2.0;
 
 /// An arm that operators steer. Clones refer to the same arm.
 #[derive(Clone, Debug)]
@@ -36,7 +36,7 @@ impl SteeredArm {
 
     /// A simulated arm that is on its tour until [`Self::begin`].
     #[cfg(feature = "sim")]
-    fn simulated(arm: sim::SteeredArm) -> Self {
+    pub(super) fn simulated(arm: sim::SteeredArm) -> Self {
         Self {
             port: arm.port().clone(),
             simulated: Some(arm),
@@ -76,7 +76,7 @@ impl SteeredArm {
 /// # Errors
 ///
 /// For the reasons of [`super::rig`] and [`check_steerable`], or if the arm cannot be enabled.
-pub fn steered(rig: Rig, devices: Devices) -> anyhow::Result<(Opened, SteeredArm)> {
+pub(super) fn steered(rig: Rig, devices: Devices) -> anyhow::Result<(Opened, SteeredArm)> {
     check_steerable(&rig, devices)?;
     super::open_rig_with(rig, devices, open_devices)
 }
@@ -115,7 +115,7 @@ fn open_real(rig: &mut Rig) -> anyhow::Result<(drivers::Devices, SteeredArm)> {
 }
 
 /// Switches an arm to steering, and adds it to the devices that are read.
-fn steer(
+pub(super) fn steer(
     mut arm: Box<dyn MovableArm>,
     devices: &mut drivers::Devices,
 ) -> anyhow::Result<SteeredArm> {
@@ -164,19 +164,13 @@ fn open_emulated(_rig: &mut Rig) -> anyhow::Result<(drivers::Devices, SteeredArm
 ///
 /// # Errors
 ///
-/// If the rig has no arm, its arm cannot be moved, its base moves, it has joints beside those that
-/// move the flange, or a simulation waits for the trainer.
-pub fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
+/// If the rig has no arm, its arm cannot be moved, it has joints beside those that move the flange,
+/// or a simulation waits for the trainer.
+pub(super) fn check_steerable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
     let is_simulated = devices == Devices::Sim || rig.arm.driver == ArmDriver::Sim;
     if rig.arm.joints.is_empty() || (rig.arm.driver == ArmDriver::None && !is_simulated) {
         bail!(BadInput(format!(
             "{}: the rig file has no arm that could move: remove the flag",
-            Setting::EnableMotion
-        )));
-    }
-    if rig.has_moving_base() {
-        bail!(BadInput(format!(
-            "{}: an arm on a moving base cannot be steered yet: use a rig file with a fixed base, or remove the flag",
             Setting::EnableMotion
         )));
     }
@@ -310,9 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn arms_on_moving_bases_and_rigs_without_arms_are_not_steered() {
-        let mobile_arm = refusal("mobile-arm.toml", &[], Devices::Real).unwrap_or_default();
-        assert!(mobile_arm.contains("moving base"), "{mobile_arm}");
+    fn rigs_without_arms_have_no_arm_to_steer() {
         let no_arm = refusal("mobile-base.toml", &[], Devices::Sim).unwrap_or_default();
         assert!(no_arm.contains("no arm"), "{no_arm}");
     }

@@ -1,7 +1,8 @@
-//! Opens the devices of a rig with a base that operators drive.
+//! Opens the devices of a rig with a base that operators drive, and with the arm on it.
 
 use super::real;
 use super::robot_tap::RobotTap;
+use super::steered::{SteeredArm, check_steerable, steer};
 use super::{Devices, Opened, check_arm, is_any_simulated};
 use crate::config::{
     ArmDriver, BaseDriver, BaseMotion, Camera, CameraDriver, Rig, Scanner, ScannerDriver,
@@ -84,44 +85,84 @@ impl SteeredBase {
     }
 }
 
-/// Whether operators drive the base of a rig, instead of its arm.
-#[must_use]
-pub fn is_base_steered(rig: &Rig, devices: Devices) -> bool {
-    match devices {
-        Devices::Sim => super::base_moves(rig),
-        Devices::Real => rig.has_moving_base(),
+/// The parts of a robot that operators of a run move.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct SteeredParts {
+    pub(super) arm: bool,
+    pub(super) base: bool,
+}
+
+impl SteeredParts {
+    /// The parts that a rig permits to move. In simulations, these are all.
+    pub(super) fn of(rig: &Rig, devices: Devices) -> Self {
+        let has_arm = !rig.arm.joints.is_empty();
+        let is_simulated = devices == Devices::Sim || rig.base.driver == BaseDriver::Sim;
+        if is_simulated {
+            let base = super::base_moves(rig);
+            return Self {
+                arm: has_arm || !base,
+                base,
+            };
+        }
+        let base = rig.has_moving_base();
+        let is_arm_permitted = has_arm && rig.arm.motion.is_some();
+        Self {
+            arm: is_arm_permitted || !base,
+            base,
+        }
     }
 }
 
-/// Opens the devices of a rig, see [`super::rig`], with a base that operators drive.
+/// Opens the devices of a rig, see [`super::rig`], with a base that operators drive, and with its
+/// arm if they steer it, too.
 ///
 /// # Errors
 ///
-/// For the reasons of [`super::rig`] and [`check_drivable`], or if the base cannot be driven.
-pub fn with_steered_base(rig: Rig, devices: Devices) -> anyhow::Result<(Opened, SteeredBase)> {
+/// For the reasons of [`super::rig`] and [`check_drivable`], or if the base cannot be driven, or the
+/// arm not be enabled.
+pub(super) fn with_steered_base(
+    rig: Rig,
+    devices: Devices,
+) -> anyhow::Result<(Opened, (SteeredBase, Option<SteeredArm>))> {
     check_drivable(&rig, devices)?;
-    super::open_rig_with(rig, devices, open_devices)
+    let is_arm_steered = SteeredParts::of(&rig, devices).arm;
+    super::open_rig_with(rig, devices, |rig, _| open_devices(rig, is_arm_steered))
 }
+
+/// A base, and its arm if it is steered.
+type Robot = (SteeredBase, Option<SteeredArm>);
 
 /// Opens the devices of a rig whose settings are checked.
 fn open_devices(
     rig: &mut Rig,
-    _arm_driver: ArmDriver,
-) -> anyhow::Result<(Box<dyn Source>, StampClock, SteeredBase)> {
+    is_arm_steered: bool,
+) -> anyhow::Result<(Box<dyn Source>, StampClock, Robot)> {
     let motion = rig.base.motion.clone().unwrap_or_default();
     if rig.base.driver == BaseDriver::Sim {
-        let (source, base) = open_simulated(rig, &motion)?;
-        return Ok((source, StampClock::Computer, base));
+        let (source, robot) = open_simulated(rig, &motion, is_arm_steered)?;
+        return Ok((source, StampClock::Computer, robot));
     }
-    let (mut devices, _) = real::open(rig, &mut real::end_on_failure)
-        .map_err(|error| super::with_sim_hint(error, rig))?;
+    let driver = rig.arm.driver;
+    if is_arm_steered {
+        // It is opened last, as by `steered.rs`.
+        rig.arm.driver = ArmDriver::None;
+    }
+    let opened = real::open(rig, &mut real::end_on_failure);
+    rig.arm.driver = driver;
+    let (mut devices, _) = opened.map_err(|error| super::with_sim_hint(error, rig))?;
     let tap = RobotTap::default();
     devices.base = devices.base.map(|base| tap.of_base(base));
     devices.arm = devices.arm.map(|arm| tap.of_arm(arm));
-    // The base is reached last, so that it is driven only if everything else works.
+    // The base is reached after all devices that only report, so that it is driven only if they
+    // work. An arm is enabled last.
     let base = open_real(&motion, tap)?;
+    let arm = if is_arm_steered {
+        Some(steer(real::movable_arm(rig)?, &mut devices)?)
+    } else {
+        None
+    };
     let source = Box::new(LiveDevices::new(devices)?);
-    Ok((source, StampClock::Computer, base))
+    Ok((source, StampClock::Computer, (base, arm)))
 }
 
 fn open_real(motion: &BaseMotion, tap: RobotTap) -> anyhow::Result<SteeredBase> {
@@ -145,21 +186,30 @@ fn open_real(motion: &BaseMotion, tap: RobotTap) -> anyhow::Result<SteeredBase> 
 fn open_simulated(
     rig: &Rig,
     motion: &BaseMotion,
-) -> anyhow::Result<(Box<dyn Source>, SteeredBase)> {
-    let (source, (base, driven)) = super::simulated::with_steered_base(rig)?;
+    is_arm_steered: bool,
+) -> anyhow::Result<(Box<dyn Source>, Robot)> {
+    let limits = is_arm_steered
+        .then(|| super::arm_config::simulated_limits(rig))
+        .transpose()?;
+    let limits = limits.as_ref().map(|motion| sim::SteeredLimits {
+        motion,
+        brake_factor: super::steered::BRAKE_FACTOR,
+    });
+    let (source, robot) = super::simulated::with_steered_base(rig, limits)?;
     let base = SteeredBase {
-        drive: BaseDrive::start(driven, motion.limits())?,
+        drive: BaseDrive::start(robot.driven, motion.limits())?,
         tap: RobotTap::default(),
-        simulated: Some(base),
+        simulated: Some(robot.base),
     };
-    Ok((source, base))
+    Ok((source, (base, robot.arm.map(SteeredArm::simulated))))
 }
 
 #[cfg(not(feature = "sim"))]
 fn open_simulated(
     _rig: &Rig,
     _motion: &BaseMotion,
-) -> anyhow::Result<(Box<dyn Source>, SteeredBase)> {
+    _is_arm_steered: bool,
+) -> anyhow::Result<(Box<dyn Source>, Robot)> {
     bail!(
         "this program was built without the simulator: build it with `cargo build --release --features sim`"
     )
@@ -168,6 +218,10 @@ fn open_simulated(
 /// Why a rig with real and simulated devices is refused.
 const MIXED: &str = "the base and all other devices must be real, or all must be simulated, so that \
                      the images show the motion";
+
+/// Why a rig is refused whose arm has no stowed posture.
+const STOWED_MISSING: &str = "base.motion.stowed is missing: set it to the positions of the arm's \
+                              joints while the base moves";
 
 /// Whether any device of a rig is real.
 fn is_any_real(rig: &Rig) -> bool {
@@ -181,19 +235,15 @@ fn is_any_real(rig: &Rig) -> bool {
 ///
 /// # Errors
 ///
-/// If the base cannot be driven, the posture in which its arm is stowed is not known, a simulated
-/// base has an arm, or a simulation waits for the trainer.
-pub fn check_drivable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
+/// If the base cannot be driven, its arm cannot be steered although the rig file permits it, the
+/// posture in which the arm is stowed is not known, or a simulation waits for the trainer.
+pub(super) fn check_drivable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
     let refusal = |why: &str| Err(BadInput(format!("{}: {why}", Setting::EnableMotion)).into());
     let is_simulated = devices == Devices::Sim || rig.base.driver == BaseDriver::Sim;
-    let has_arm = !rig.arm.joints.is_empty() && rig.arm.driver != ArmDriver::None;
+    let has_arm = !rig.arm.joints.is_empty() && (is_simulated || rig.arm.driver != ArmDriver::None);
+    let stowed = rig.base.motion.as_ref().map(|motion| &motion.stowed);
+    let is_stowed_known = !has_arm || stowed.is_some_and(|stowed| !stowed.is_empty());
     if is_simulated {
-        if has_arm {
-            return refusal(
-                "a moving base with an arm cannot be steered in simulation yet: use a rig file \
-                 without an arm or with a fixed base, or remove the flag",
-            );
-        }
         if devices == Devices::Real && is_any_real(rig) {
             return refusal(MIXED);
         }
@@ -206,7 +256,16 @@ pub fn check_drivable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
                  steered: remove sim.lockstep from the rig file, or remove the flag",
             );
         }
-        return Ok(());
+        if rig.sim.emulate_arm && has_arm {
+            return refusal(
+                "an emulated arm on a moving base cannot be steered: remove sim.emulate_arm from the \
+                 rig file, or remove the flag",
+            );
+        }
+        if !is_stowed_known {
+            return refusal(STOWED_MISSING);
+        }
+        return check_arm_on_base(rig, devices);
     }
     if is_any_simulated(rig) {
         return refusal(MIXED);
@@ -223,13 +282,19 @@ pub fn check_drivable(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
              such as \"192.168.1.5:7020\"",
         );
     }
-    if has_arm && motion.stowed.is_empty() {
-        return refusal(
-            "base.motion.stowed is missing: set it to the positions of the arm's joints while the \
-             base moves",
-        );
+    if !is_stowed_known {
+        return refusal(STOWED_MISSING);
     }
-    check_arm(rig)
+    check_arm(rig)?;
+    check_arm_on_base(rig, devices)
+}
+
+/// Checks the arm on a base, if it is steered.
+fn check_arm_on_base(rig: &Rig, devices: Devices) -> anyhow::Result<()> {
+    if SteeredParts::of(rig, devices).arm {
+        check_steerable(rig, devices)?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -241,7 +306,7 @@ mod tests {
     fn refusal(name: &str, overrides: &[Override], devices: Devices) -> Option<String> {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
         let rig = Rig::load(&folder.join(name), overrides).expect("a rig of this repository");
-        assert!(is_base_steered(&rig, devices));
+        assert!(SteeredParts::of(&rig, devices).base);
         let error = check_drivable(&rig, devices).err()?;
         Some(format!("{error:#}"))
     }
@@ -256,15 +321,12 @@ mod tests {
         let with = |more: &[Override]| [&real[..], more].concat();
         let address = Override::new("base.motion.address", "127.0.0.1:7020");
         let stowed = Override::new("base.motion.stowed", vec![0.0; 7]);
+        let unknown = Override::new("base.motion.stowed", Vec::<f64>::new());
         for (overrides, expected) in [
             (&real[..1], Some("all must be simulated")),
-            (&real[..], Some("no table")),
+            (&real[..], Some("base.motion.address is missing")),
             (
-                &with(&[Override::new("base.motion.max_yaw_rad_s", 0.3)]),
-                Some("base.motion.address is missing"),
-            ),
-            (
-                &with(std::slice::from_ref(&address)),
+                &with(&[address.clone(), unknown]),
                 Some("base.motion.stowed is missing"),
             ),
             (&with(&[address, stowed]), None),
@@ -272,10 +334,6 @@ mod tests {
             let refusal = refusal("mobile-arm.toml", overrides, Devices::Real);
             match expected {
                 None => assert_eq!(refusal, None),
-                Some("no table") => {
-                    let refusal = refusal.unwrap_or_default();
-                    assert!(refusal.contains("[base.motion]"), "{refusal}");
-                }
                 Some(words) => {
                     let refusal = refusal.unwrap_or_default();
                     assert!(refusal.contains(words), "{refusal}");
@@ -286,12 +344,17 @@ mod tests {
 
     #[cfg(feature = "sim")]
     #[test]
-    fn simulated_bases_without_arms_are_driven_in_real_time() {
+    fn simulated_bases_are_driven_in_real_time_and_their_arms_must_be_stowed() {
         assert_eq!(refusal("mobile-base.toml", &[], Devices::Sim), None);
         let lockstep = [Override::new("sim.lockstep", true)];
         let refused = refusal("mobile-base.toml", &lockstep, Devices::Sim).unwrap_or_default();
         assert!(refused.contains("waits for the trainer"), "{refused}");
-        let refused = refusal("mobile-arm.toml", &[], Devices::Sim).unwrap_or_default();
-        assert!(refused.contains("base with an arm"), "{refused}");
+        assert_eq!(refusal("mobile-arm.toml", &[], Devices::Sim), None);
+        let unknown = [Override::new("base.motion.stowed", Vec::<f64>::new())];
+        let refused = refusal("mobile-arm.toml", &unknown, Devices::Sim).unwrap_or_default();
+        assert!(
+            refused.contains("base.motion.stowed is missing"),
+            "{refused}"
+        );
     }
 }

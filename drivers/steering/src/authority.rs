@@ -7,12 +7,12 @@ use crate::error::Error;
 use crate::lease::{Holder, Lease, LeaseConfig};
 use crate::reason::{Link, Reason};
 use crate::request::{Command, Operator, Request};
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
 use serde::{Deserialize, Serialize};
 
-/// The right to move a robot.
+/// The right to move a robot: one lease, one dead-man switch and one stop for all of its parts.
 #[derive(Clone, Debug)]
-pub(crate) struct Authority {
+pub struct Authority {
     lease: Lease,
     clutch: Clutch,
     stops: Stops,
@@ -47,16 +47,29 @@ pub(crate) struct AuthorityState {
     pub(crate) latest_nanos: Option<i64>,
 }
 
+impl AuthorityState {
+    /// Number of joint values of the intent that is followed, if it has any.
+    pub(crate) fn n_joints(&self) -> Option<usize> {
+        self.clutch.n_joints()
+    }
+}
+
 impl Authority {
     /// Nobody has control.
     ///
+    /// * `n_joints`: number of joints that operators may move.
+    ///
     /// # Errors
     /// If a value of the configuration is not positive.
-    pub(crate) fn new(lease: LeaseConfig, clutch: ClutchConfig) -> Result<Self, Error> {
+    pub(crate) fn new(
+        lease: LeaseConfig,
+        clutch: ClutchConfig,
+        n_joints: usize,
+    ) -> Result<Self, Error> {
         check_operator_times(&lease, &clutch)?;
         Ok(Self {
             lease: Lease::new(lease),
-            clutch: Clutch::new(clutch, 0),
+            clutch: Clutch::new(clutch, n_joints),
             stops: Stops::default(),
             last_brake: None,
             n_grips: 0,
@@ -84,21 +97,54 @@ impl Authority {
         self.latest_nanos = state.latest_nanos;
     }
 
-    pub(crate) fn lease(&self) -> &Lease {
-        &self.lease
+    /// Who has control, and since when.
+    pub fn holder(&self) -> Option<(Operator, Stamp)> {
+        self.lease.holder()
     }
 
-    /// The link and the first reason of a stop that lasts.
-    pub(crate) fn stop(&self) -> Option<&(Link, Reason)> {
+    /// Time until the lease expires if its holder is silent; `None` if nobody has control.
+    pub fn lease_left_secs(&self, now: Stamp) -> Option<f64> {
+        self.lease.left_secs(now)
+    }
+
+    /// The operator who may take control from its holder now.
+    pub fn offered_to(&self, now: Stamp) -> Option<Operator> {
+        self.lease.offered_to(now)
+    }
+
+    /// The link and the first reason of a stop that lasts: why the robot stays at rest until an
+    /// operator permits motion.
+    pub fn stop(&self) -> Option<&(Link, Reason)> {
         self.stops.first.as_ref()
     }
 
-    pub(crate) fn newest_stop(&self) -> Option<&Reason> {
+    /// Why the robot was stopped since, if somebody or something has stopped it again for another
+    /// reason than [`Authority::stop`].
+    pub fn newest_stop(&self) -> Option<&Reason> {
         self.stops.newest.as_ref()
     }
 
-    pub(crate) fn stop_number(&self) -> u64 {
+    /// Number of the newest stop, which a permission must name; 0 before the first. Each stop by
+    /// anybody, and each fault of the robot, has its own number.
+    pub fn stop_number(&self) -> u64 {
         self.stops.number
+    }
+
+    /// Checks that a permission names the newest stop.
+    ///
+    /// # Errors
+    /// That it names another one.
+    pub fn check_stop(&self, named: u64) -> Result<(), Reason> {
+        let newest = self.stops.number;
+        if named == newest {
+            return Ok(());
+        }
+        Err(Reason::OtherStop { named, newest })
+    }
+
+    /// Whether the grip that is held moves the base; `None` while no grip is held.
+    pub fn moves_base(&self) -> Option<bool> {
+        Some(self.clutch.held()?.intent.is_of_base())
     }
 
     /// The device whose switch is closed.
@@ -111,9 +157,17 @@ impl Authority {
         self.n_grips
     }
 
-    /// Latest time at which the newest command may still be followed.
-    pub(crate) fn deadline(&self) -> Option<Stamp> {
-        self.clutch.deadline()
+    /// The goal pose of the tip, if the intent has one; see [`Clutch::goal`].
+    pub(crate) fn goal(&mut self, base_from_tip: &Transform) -> Option<Transform> {
+        self.clutch.goal(base_from_tip)
+    }
+
+    /// When a target of now expires: after `secs`, or when the newest command may no longer be
+    /// followed. If the chain does not run any more, the thread of the robot then also brakes
+    /// because of a silent device.
+    pub(crate) fn expiry(&self, now: Stamp, secs: f64) -> Stamp {
+        let expiry = now.plus_secs(secs);
+        self.clutch.deadline().map_or(expiry, |end| end.min(expiry))
     }
 
     /// Sets the time, and ends an expired lease.
@@ -201,10 +255,7 @@ impl Authority {
 
     fn permit_motion(&mut self, now: Stamp, operator: Operator, named: u64) -> Result<(), Reason> {
         self.lease.renew(now, operator)?;
-        let newest = self.stops.number;
-        if named != newest {
-            return Err(Reason::OtherStop { named, newest });
-        }
+        self.check_stop(named)?;
         // A fault is reported again in the next cycle, if it is still there.
         self.stops.first = None;
         self.stops.newest = None;

@@ -1,12 +1,10 @@
 //! Keeps a base inside a rectangle on the floor.
 
+use crate::base_clearance::stoppable_m_s;
 use crate::base_verdict::FloorPose;
 use crate::reason::Reason;
 use drivers::base_motion::{BaseLimits, BaseVelocity};
 
-/// Time until the base reacts to a decision, seconds: the age of its pose, the transmission of the
-/// command, and the reaction of its controller. During this time, the base does not slow down.
-const REACTION_SECS: f64 = 0.35;
 /// Distance from the edge at which the base stops, meters: its pose has errors of this size.
 const STOP_BEFORE_M: f64 = 0.02;
 /// Number of headings that are compared while the base turns.
@@ -46,16 +44,18 @@ impl Area {
     ///
     /// * `measured`: the velocity that the base has. If it is too fast toward an edge, the base
     ///   first comes to rest without turning, for every `wanted`.
+    /// * `reaction_secs`: time during which the base does not slow down.
     pub(crate) fn permitted(
         &self,
         pose: &FloorPose,
         wanted: BaseVelocity,
         measured: &BaseVelocity,
         limits: &BaseLimits,
+        reaction_secs: f64,
     ) -> (BaseVelocity, Option<(f64, Reason)>) {
         let place = [pose.x_m, pose.y_m];
-        let wanted_m_s = fastest_toward(&wanted, pose, limits);
-        let measured_m_s = fastest_toward(measured, pose, limits);
+        let wanted_m_s = fastest_toward(&wanted, pose, limits, reaction_secs);
+        let measured_m_s = fastest_toward(measured, pose, limits, reaction_secs);
         let mut scale: f64 = 1.0;
         let mut is_too_fast = false;
         for axis in 0..2 {
@@ -64,7 +64,8 @@ impl Area {
                 place[axis] - self.lower[axis],
             ];
             for (side, left_m) in left_m.into_iter().enumerate() {
-                let permitted_m_s = stoppable_m_s(left_m - STOP_BEFORE_M, limits.acceleration_m_s2);
+                let left_m = left_m - STOP_BEFORE_M;
+                let permitted_m_s = stoppable_m_s(left_m, limits.acceleration_m_s2, reaction_secs);
                 let wanted_m_s = wanted_m_s[axis][side];
                 if measured_m_s[axis][side] > TOO_FAST * permitted_m_s + NOISE_M_S {
                     is_too_fast = true;
@@ -90,8 +91,13 @@ impl Area {
 /// Largest speeds toward both ends of both axes of the world, m/s, until a base with this velocity
 /// could stand still. A base that turns changes its direction meanwhile, and slowing down may take
 /// all of its acceleration.
-fn fastest_toward(velocity: &BaseVelocity, pose: &FloorPose, limits: &BaseLimits) -> [[f64; 2]; 2] {
-    let stop_secs = REACTION_SECS + velocity.speed_m_s() / limits.acceleration_m_s2;
+fn fastest_toward(
+    velocity: &BaseVelocity,
+    pose: &FloorPose,
+    limits: &BaseLimits,
+    reaction_secs: f64,
+) -> [[f64; 2]; 2] {
+    let stop_secs = reaction_secs + velocity.speed_m_s() / limits.acceleration_m_s2;
     let turn_rad = velocity.yaw_rad_s * stop_secs;
     let mut fastest: [[f64; 2]; 2] = [[0.0; 2]; 2];
     for ix in 0..N_HEADINGS {
@@ -106,14 +112,4 @@ fn fastest_toward(velocity: &BaseVelocity, pose: &FloorPose, limits: &BaseLimits
         }
     }
     fastest
-}
-
-/// Largest speed that still permits a stop within a distance, after the reaction time: the positive
-/// solution of `distance = reaction * speed + speed^2 / (2 * deceleration)`.
-fn stoppable_m_s(distance_m: f64, deceleration_m_s2: f64) -> f64 {
-    if distance_m <= 0.0 {
-        return 0.0;
-    }
-    let reaction = deceleration_m_s2 * REACTION_SECS;
-    (reaction * reaction + 2.0 * deceleration_m_s2 * distance_m).sqrt() - reaction
 }

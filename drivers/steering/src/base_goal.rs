@@ -7,7 +7,7 @@
 
 use crate::base_verdict::FloorPose;
 use drivers::base_motion::{BaseLimits, BaseVelocity};
-use std::f64::consts::PI;
+use std::f64::consts::{E, PI};
 
 /// A base reaches its goal within the first distance, and leaves it beyond the second one, meters.
 /// Localization has noise of this size.
@@ -18,9 +18,6 @@ const AT_HEADING_RAD: f64 = 0.03;
 /// Fraction of the acceleration limit with which the base slows down before the goal. The rest is
 /// a reserve for decelerating later than planned.
 const DECELERATION_FRAC: f64 = 0.5;
-/// Close to the goal, the speed is the distance divided by this time, seconds. It is longer than
-/// the delay from the pose to the motion of the base, so the base does not swing around the goal.
-const SETTLE_SECS: f64 = 0.6;
 /// Bearing of the goal, radians, beyond which a base that cannot move sideways only turns.
 const TURN_ONLY_RAD: f64 = 0.35;
 
@@ -37,12 +34,17 @@ pub(crate) struct GoalStep {
 /// The velocity toward a goal.
 ///
 /// * `was_at_place`: whether the place was reached before.
+/// * `reaction_secs`: time from the pose until the base follows the velocity.
 pub(crate) fn toward(
     goal: &FloorPose,
     pose: &FloorPose,
     limits: &BaseLimits,
     was_at_place: bool,
+    reaction_secs: f64,
 ) -> GoalStep {
+    // Close to the goal, the speed is the distance divided by a time. A delayed loop of this kind
+    // does not overshoot if the time is at least e times the delay.
+    let settle_secs = E * reaction_secs;
     let x = goal.x_m - pose.x_m;
     let y = goal.y_m - pose.y_m;
     let distance_m = x.hypot(y);
@@ -55,11 +57,12 @@ pub(crate) fn toward(
             angle_rad.abs(),
             limits.max_yaw_rad_s,
             limits.yaw_acceleration_rad_s2,
+            settle_secs,
         );
         speed.copysign(angle_rad)
     };
     let bearing_rad = wrapped(y.atan2(x) - pose.yaw_rad);
-    let speed_of = |max_m_s: f64| pace(distance_m, max_m_s, limits.acceleration_m_s2);
+    let speed_of = |max_m_s: f64| pace(distance_m, max_m_s, limits.acceleration_m_s2, settle_secs);
     let velocity = if has_arrived {
         BaseVelocity::ZERO
     } else if is_at_place {
@@ -92,9 +95,9 @@ pub(crate) fn toward(
 
 /// Speed at a distance from the goal. From this speed, the base can decelerate to zero. Close to
 /// the goal, the speed is proportional to the distance.
-fn pace(distance: f64, max_speed: f64, acceleration: f64) -> f64 {
+fn pace(distance: f64, max_speed: f64, acceleration: f64, settle_secs: f64) -> f64 {
     let decelerated = (2.0 * DECELERATION_FRAC * acceleration * distance).sqrt();
-    max_speed.min(decelerated).min(distance / SETTLE_SECS)
+    max_speed.min(decelerated).min(distance / settle_secs)
 }
 
 /// An angle between -π and π.

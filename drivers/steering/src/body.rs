@@ -35,6 +35,16 @@ struct Frame {
     motion: Option<JointMotion>,
 }
 
+impl Frame {
+    fn base() -> Self {
+        Self {
+            parent: None,
+            parent_from_joint: Transform::identity(),
+            motion: None,
+        }
+    }
+}
+
 #[derive(Clone, Debug)]
 struct JointMotion {
     joint_ix: usize,
@@ -100,13 +110,24 @@ impl Body {
         Ok(body)
     }
 
+    /// The body of a base without a robot description: rigid capsules in the frame of the base link.
+    pub fn of_base(base_link: &str, capsules: &[Capsule]) -> Self {
+        let part = |capsule: &Capsule| Part {
+            link: base_link.to_owned(),
+            frame_ix: 0,
+            capsule_in_frame: *capsule,
+        };
+        Self {
+            frames: vec![Frame::base()],
+            parts: capsules.iter().map(part).collect(),
+            notes: Vec::new(),
+            n_joints: 0,
+        }
+    }
+
     fn without_parts(chain: &Chain) -> Self {
         Self {
-            frames: vec![Frame {
-                parent: None,
-                parent_from_joint: Transform::identity(),
-                motion: None,
-            }],
+            frames: vec![Frame::base()],
             parts: Vec::new(),
             notes: Vec::new(),
             n_joints: chain.n_joints(),

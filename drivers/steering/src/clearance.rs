@@ -36,6 +36,15 @@ pub trait Clearance {
     /// * `points_in_base`: points in the frame of the arm's base, meters.
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>>;
 
+    /// What is known about points of the footprint of a base. The space that the footprint occupies
+    /// now is free. A model without a base knows nothing.
+    ///
+    /// * `points_in_base`: points in the frame of the base link, meters.
+    fn base_readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        let _ = (points_in_base, now);
+        Vec::new()
+    }
+
     /// Why the model is no longer updated, in words; `None` while it is. The arm is stopped after a
     /// failure, because the scene may change.
     fn failure(&self) -> Option<String> {
@@ -87,7 +96,7 @@ impl Default for ClearanceConfig {
 
 impl ClearanceConfig {
     /// Growth of the distances with age.
-    fn growth_m(&self, age_secs: f64) -> f64 {
+    pub(crate) fn growth_m(&self, age_secs: f64) -> f64 {
         (self.growth_m_s * (age_secs - self.fresh_secs).max(0.0)).min(self.max_growth_m)
     }
 
@@ -98,7 +107,25 @@ impl ClearanceConfig {
         1.0 - staleness_frac * (1.0 - self.stale_frac)
     }
 
-    fn check(&self) -> Result<(), Error> {
+    /// Fraction of full speed because of a reading.
+    pub(crate) fn scale_of(&self, seen: Seen) -> f64 {
+        let growth_m = self.growth_m(seen.age_secs);
+        let near = speed_scale(
+            seen.distance_m - growth_m,
+            self.stop_m,
+            self.slow_m,
+            self.creep_frac,
+        );
+        // Both factors act at once: near a surface, a stale region deserves more caution.
+        (near * self.age_scale(seen.age_secs)).max(self.creep_frac.min(self.stale_frac))
+    }
+
+    /// Whether a reading is too far away to slow the robot down because of its distance.
+    pub(crate) fn is_far(&self, seen: &Seen) -> bool {
+        seen.distance_m >= self.slow_m + self.growth_m(seen.age_secs)
+    }
+
+    pub(crate) fn check(&self) -> Result<(), Error> {
         check_ramp("clearance", self.stop_m, self.slow_m, self.creep_frac)?;
         let fresh = self.fresh_secs;
         check(
@@ -145,13 +172,13 @@ pub struct Restriction {
 
 /// A distance in steps of 0.1 mm. It is far more exact than any map, and the records of long motions
 /// stay small.
-fn rounded_down_m(distance_m: f64) -> f64 {
+pub(crate) fn rounded_down_m(distance_m: f64) -> f64 {
     const STEPS_PER_M: f64 = 1e4;
     (distance_m * STEPS_PER_M + ROUNDING).floor() / STEPS_PER_M
 }
 
 /// An age in steps of 0.1 s, for the same reason.
-fn rounded_up_secs(age_secs: f64) -> f64 {
+pub(crate) fn rounded_up_secs(age_secs: f64) -> f64 {
     const STEPS_PER_SEC: f64 = 10.0;
     (age_secs * STEPS_PER_SEC - ROUNDING).ceil() / STEPS_PER_SEC
 }
@@ -226,7 +253,7 @@ impl ClearancePoints {
                 distance_m: rounded_down_m((seen.distance_m - point.radius_m).clamp(-1e3, 1e3)),
                 age_secs: rounded_up_secs(seen.age_secs.min(1e9)),
             });
-            if seen.is_none_or(|seen| self.scale_of(seen) < 1.0) {
+            if seen.is_none_or(|seen| self.config.scale_of(seen) < 1.0) {
                 restrictions.push(Restriction { point_ix, seen });
             }
         }
@@ -243,7 +270,7 @@ impl ClearancePoints {
         let scale = |restriction: &Restriction| {
             restriction
                 .seen
-                .map_or(self.config.creep_frac, |seen| self.scale_of(seen))
+                .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen))
         };
         let slowest = here.iter().min_by(|a, b| scale(a).total_cmp(&scale(b)));
         slowest.map_or((1.0, None), |slowest| {
@@ -305,14 +332,14 @@ impl ClearancePoints {
         let point_ix = restriction.point_ix;
         let part = body.part(self.points[point_ix].part_ix).link.clone();
         let place = points_in_base[point_ix];
-        let Some(Seen {
-            distance_m,
-            age_secs,
-        }) = restriction.seen
-        else {
+        let Some(seen) = restriction.seen else {
             return Reason::NeverSeen { part, place };
         };
-        if distance_m >= self.config.slow_m + self.config.growth_m(age_secs) {
+        let Seen {
+            distance_m,
+            age_secs,
+        } = seen;
+        if self.config.is_far(&seen) {
             return Reason::LongUnseen {
                 part,
                 age_secs,
@@ -325,19 +352,6 @@ impl ClearancePoints {
             age_secs,
             place,
         }
-    }
-
-    fn scale_of(&self, seen: Seen) -> f64 {
-        let config = &self.config;
-        let growth_m = config.growth_m(seen.age_secs);
-        let near = speed_scale(
-            seen.distance_m - growth_m,
-            config.stop_m,
-            config.slow_m,
-            config.creep_frac,
-        );
-        // Both factors act at once: near a surface, a stale region deserves more caution.
-        (near * config.age_scale(seen.age_secs)).max(config.creep_frac.min(config.stale_frac))
     }
 
     /// How far a part is inside the stop distance; infinite if the region was never seen.

@@ -313,6 +313,11 @@ impl Clutch {
         let Some(held) = &mut self.held else {
             return Ok(Change::Open);
         };
+        if held.intent.is_of_base() != command.intent.is_of_base() {
+            // A person who moves one part must not move the other one unawares.
+            self.open();
+            return Err(Reason::OtherPart);
+        }
         let secs = command
             .captured_at
             .secs_since(held.captured_at)

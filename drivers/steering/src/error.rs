@@ -23,6 +23,9 @@ pub enum Error {
         /// Number expected.
         expected: usize,
     },
+    /// The state of a record is that of another robot.
+    #[error("the state in the record does not fit the parts of its robot: it is damaged")]
+    Parts,
     /// A value is out of its range.
     #[error("steering: {what} is {value}, must be {expected}")]
     Value {

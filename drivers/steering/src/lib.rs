@@ -18,9 +18,11 @@
 //! rest of the program. Acceleration and jerk are limited there, by the generator of
 //! [`drivers::motion`].
 //!
-//! A base has a chain of its own, [`BaseSteering`], with the same lease and the same dead-man switch.
-//! It decides about velocities and goals on the floor, and lets the base move only while the arm on
-//! it is stowed.
+//! A base has links of its own after the same lease and the same dead-man switch
+//! ([`Steering::of_base`]): posture of the arm on it, limits, area and goals on the floor, and its
+//! clearance. A robot with both ([`Steering::with_base`]) has one operator, and each grip moves
+//! either its arm or its base. The base moves only while the arm is stowed, and the arm is slower
+//! while the base moves.
 //!
 //! Nothing here has a clock, a thread or a connection: every function takes the time. The same
 //! calls give the same decisions, bit for bit, so [`Steering::take_record`] gives records that
@@ -83,11 +85,13 @@
 //! ```
 
 mod analytic_scene;
+mod arm_chain;
 mod authority;
 mod base_area;
+mod base_chain;
+mod base_clearance;
+mod base_footprint;
 mod base_goal;
-mod base_record;
-mod base_steering;
 mod base_verdict;
 mod body;
 mod capsule;
@@ -111,8 +115,11 @@ mod tests;
 mod verdict;
 
 pub use analytic_scene::{AnalyticScene, Solid};
-pub use base_record::BaseEntry;
-pub use base_steering::{BaseSetup, BaseSteering, BaseSteeringConfig, BaseSteeringState};
+pub use arm_chain::{Robot, SteeringConfig};
+pub use authority::Authority;
+pub use base_chain::BaseSteeringConfig;
+pub use base_clearance::{BaseClearanceConfig, Room};
+pub use base_footprint::Footprint;
 pub use base_verdict::{BaseSituation, BaseVerdict, FloorPose, SeenPose, SeenPosture};
 pub use body::Body;
 pub use capsule::{Capsule, Gap};
@@ -123,14 +130,14 @@ pub use inverse::{InverseKinematics, NearestPosture};
 pub use lease::LeaseConfig;
 pub use limits::LimitConfig;
 pub use reason::{Effect, Limit, Link, Reason};
-pub use record::{Difference, Entry};
+pub use record::{ArmCycle, BaseCycle, Difference, Entry};
 pub use request::{Command, Device, Intent, Operator, Request};
 pub use self_collision::{SelfCollision, SelfCollisionConfig};
-pub use steering::setup::Setup;
+pub use steering::Steering;
+pub use steering::setup::{ArmSetup, Setup};
 pub use steering::state::State;
-pub use steering::{Robot, Steering, SteeringConfig};
 pub use stowed::Stowed;
-pub use verdict::Verdict;
+pub use verdict::{Decision, Situation, Verdict};
 
 /// What passes between the chain and the arm's thread.
 pub use drivers::motion::{ArmState, Follower, NotFollowed, Output, Target, brake_limits};

@@ -55,6 +55,24 @@ impl std::fmt::Display for Limit {
     }
 }
 
+/// A motion, or a part of it, that a link refuses.
+pub(crate) fn refused(link: Link, reason: Reason) -> Limit {
+    Limit {
+        link,
+        effect: Effect::Refused,
+        reason,
+    }
+}
+
+/// A link because of which the robot is at rest.
+pub(crate) fn braked(link: Link, reason: Reason) -> Limit {
+    Limit {
+        link,
+        effect: Effect::Braked,
+        reason,
+    }
+}
+
 /// A reason in words. Places are points in the frame of the arm's base, in meters; for reasons
 /// of a base, they are in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, thiserror::Error)]
@@ -308,6 +326,29 @@ pub enum Reason {
     /// A command for an arm, but only a base is steered.
     #[error("only the base is steered in this run: the command would move an arm")]
     OnlyBase,
+    /// A command for the other part of the robot than its grip.
+    #[error("this grip moves another part of the robot: let go, and grip again")]
+    OtherPart,
+    /// The arm rests while its operator moves the base.
+    #[error("the base is being moved, so the arm rests")]
+    BaseHasGrip,
+    /// The base rests while its operator moves the arm.
+    #[error("the arm is being moved, so the base rests")]
+    ArmHasGrip,
+    /// The base under the arm moves.
+    #[error("the base under the arm is moving")]
+    BaseMoves,
+    /// Something that is not known to be free is close to the base, or on its way.
+    #[error(
+        "something is {:.0} mm from the base on its way: a surface, or space that was never seen",
+        1000.0 * .distance_m
+    )]
+    BaseNear {
+        /// Distance from the footprint; negative if it is inside.
+        distance_m: f64,
+        /// A point of the footprint there.
+        place: [f64; 3],
+    },
     /// The base reports a fault.
     #[error("the base stopped: {report}; clear the fault, then permit motion again")]
     BaseStopped {
@@ -383,6 +424,7 @@ impl Reason {
             | Self::Near { place, .. }
             | Self::LongUnseen { place, .. }
             | Self::NeverSeen { place, .. }
+            | Self::BaseNear { place, .. }
             | Self::AreaEdge { place }
             | Self::GoalOutsideArea { place } => Some(*place),
             _ => None,

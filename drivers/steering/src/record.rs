@@ -1,9 +1,11 @@
 //! A record of all inputs and decisions, for recordings and replays.
 
+use crate::base_clearance::Room;
+use crate::base_verdict::{BaseSituation, BaseVerdict};
 use crate::clearance::Restriction;
 use crate::reason::Reason;
 use crate::request::Request;
-use crate::verdict::Verdict;
+use crate::verdict::{Decision, Verdict};
 use drivers::motion::{ArmState, exact};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -27,13 +29,55 @@ pub enum Entry {
         /// Its time.
         #[serde(with = "exact::stamp")]
         at: Stamp,
-        /// State of the arm.
-        arm: ArmState,
-        /// What was known about the scene, for each posture that was checked.
-        seen: Vec<Vec<Restriction>>,
-        /// The decision.
-        verdict: Verdict,
+        /// The arm; `None` if the robot has none that is steered.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        arm: Option<Box<ArmCycle>>,
+        /// The base; `None` if the robot has none that is steered.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        base: Option<Box<BaseCycle>>,
     },
+}
+
+/// The arm in one cycle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ArmCycle {
+    /// State of the arm.
+    pub state: ArmState,
+    /// What was known about the scene, for each posture that was checked.
+    pub seen: Vec<Vec<Restriction>>,
+    /// The decision.
+    pub verdict: Verdict,
+}
+
+/// The base in one cycle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BaseCycle {
+    /// State of the base and of the arm on it.
+    pub situation: BaseSituation,
+    /// What was known about the scene, for each way that was checked.
+    pub rooms: Vec<Room>,
+    /// The decision.
+    pub verdict: BaseVerdict,
+}
+
+impl Entry {
+    /// When the request arrived, or the time of the cycle.
+    pub fn at(&self) -> Stamp {
+        let (Self::Request { at, .. } | Self::Cycle { at, .. }) = self;
+        *at
+    }
+
+    /// Whether a part of the robot should follow a target.
+    pub fn has_target(&self) -> bool {
+        match self {
+            Self::Request { .. } => false,
+            Self::Cycle { arm, base, .. } => {
+                let arm = arm.as_ref().and_then(|arm| arm.verdict.target());
+                let base = base.as_ref().and_then(|base| base.verdict.target());
+                arm.is_some() || base.is_some()
+            }
+        }
+    }
 }
 
 /// The newest entries. If nobody takes them, the oldest are dropped.
@@ -86,10 +130,15 @@ pub struct Difference {
 }
 
 /// Whether two decisions are equal in every bit of their targets.
-pub(crate) fn are_identical(a: &Verdict, b: &Verdict) -> bool {
-    let bits = |verdict: &Verdict| -> Vec<u64> {
-        let position = verdict.target().map_or(&[][..], |target| &target.position);
-        position.iter().map(|q| q.to_bits()).collect()
-    };
+pub(crate) fn are_identical(a: &Decision, b: &Decision) -> bool {
     a == b && bits(a) == bits(b)
+}
+
+fn bits(decision: &Decision) -> Vec<u64> {
+    let arm = decision.arm.as_ref().and_then(Verdict::target);
+    let position = arm.map_or(&[][..], |target| &target.position);
+    let base = decision.base.as_ref().and_then(BaseVerdict::target);
+    let velocity = base.map(|target| target.velocity.to_array());
+    let numbers = position.iter().chain(velocity.iter().flatten());
+    numbers.map(|number| number.to_bits()).collect()
 }

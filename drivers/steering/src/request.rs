@@ -51,7 +51,7 @@ pub enum Request {
         by: Option<Operator>,
     },
     /// Brake, and stay at rest until [`Request::Rearm`], because nothing is known about the scene
-    /// any more. [`Steering::cycle`](crate::Steering::cycle) makes this request for
+    /// any more. [`Steering::decide`](crate::Steering::decide) makes this request for
     /// [`Clearance::failure`](crate::Clearance::failure), so that the record contains it.
     SceneLost {
         /// Why, in words.
@@ -62,10 +62,10 @@ pub enum Request {
     Rearm {
         /// Holder of the lease.
         operator: Operator,
-        /// Number of the newest stop that the person has seen ([`Steering::stop_number`]). A
+        /// Number of the newest stop that the person has seen ([`Authority::stop_number`]). A
         /// permission must not undo a stop that came after it was given.
         ///
-        /// [`Steering::stop_number`]: crate::Steering::stop_number
+        /// [`Authority::stop_number`]: crate::Authority::stop_number
         stop: u64,
     },
     /// Move the arm.
@@ -97,11 +97,6 @@ pub struct Command {
 }
 
 impl Command {
-    /// Whether the command asks for a motion of a base instead of an arm.
-    pub(crate) fn moves_base(&self) -> bool {
-        self.grip.is_some() && self.intent.is_of_base()
-    }
-
     /// When the command arrived, but not after it is decided: clocks are rounded.
     pub(crate) fn received_by(&self, now: Stamp) -> Stamp {
         self.received_at.min(now)

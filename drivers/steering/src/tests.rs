@@ -1,10 +1,12 @@
 //! Tests of the whole chain with a simulated clock.
 
+mod base_clearance_tests;
 mod base_tests;
 mod clearance_tests;
 mod clutch_tests;
 mod late_start_tests;
 mod lease_tests;
+mod mobile_tests;
 mod random_tests;
 mod replay_tests;
 mod self_collision_tests;

@@ -1,10 +1,29 @@
-//! The decision of one cycle.
+//! Inputs of one cycle, and the decision.
 
-use crate::reason::{Effect, Limit};
-use drivers::motion::{Output, Target};
+use crate::base_verdict::{BaseSituation, BaseVerdict};
+use crate::reason::{Effect, Limit, Link, Reason, braked};
+use drivers::motion::{ArmState, Output, Target};
 use serde::{Deserialize, Serialize};
 
-/// The decision of one cycle.
+/// State of the steered parts of a robot.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Situation {
+    /// The newest state of the arm, if it is steered.
+    pub arm: Option<ArmState>,
+    /// The newest state of the base, if it is steered.
+    pub base: Option<BaseSituation>,
+}
+
+/// The decision of one cycle about all steered parts of a robot.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Decision {
+    /// The arm, if it is steered.
+    pub arm: Option<Verdict>,
+    /// The base, if it is steered.
+    pub base: Option<BaseVerdict>,
+}
+
+/// The decision of one cycle about an arm.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Verdict {
     /// What the arm should do.
@@ -14,6 +33,14 @@ pub struct Verdict {
 }
 
 impl Verdict {
+    /// The decision about an arm that the chain does not have.
+    pub(crate) fn braking_without_arm() -> Self {
+        Self {
+            output: Output::Brake,
+            limits: vec![braked(Link::Clutch, Reason::OnlyBase)],
+        }
+    }
+
     /// Smallest fraction of the requested speed that a link left, 0 to 1: 0 if a link refused the
     /// motion or a part of it.
     pub fn speed_scale(&self) -> f64 {

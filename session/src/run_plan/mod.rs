@@ -30,12 +30,11 @@ use crate::resume_command::{FROM, REAL_TIME, REPEAT, ResumeCommand};
 use crate::run_folder;
 use crate::session::Limits;
 use crate::session_setup::Services;
-use crate::steering::SteeredRobot;
 use crate::training_options::{AvailableData, REALIGN, RefineSettings, TrainingOptions};
 use capture::RecordedMeshes;
 use capture::check_output_file;
 use capture::config::{ArmDriver, Need, Override, Rig};
-use capture::open::{self, Devices, Opened};
+use capture::open::{self, Devices, Opened, SteeredRobot};
 use gpu::Gpu;
 use messages::{BadInput, Setting};
 use model_files::Edits;
@@ -64,7 +63,7 @@ pub struct RunPlan {
     pub input: RunInput,
     /// File to which everything is recorded that the devices send.
     pub record: Option<PathBuf>,
-    /// Whether operators may steer the arm. It is not stored with the run: whoever resumes a run
+    /// Whether operators may steer the robot. It is not stored with the run: whoever resumes a run
     /// decides again.
     pub is_steered: bool,
     /// Folder of a run to continue, with its flags.
@@ -151,12 +150,7 @@ impl RunPlan {
         let rig = plan.read_rig(&overrides)?;
         plan.require_calibration(&rig)?;
         if plan.is_steered {
-            let devices = plan.devices()?;
-            if open::is_base_steered(&rig, devices) {
-                open::check_drivable(&rig, devices)?;
-            } else {
-                open::check_steerable(&rig, devices)?;
-            }
+            open::check_steered(&rig, plan.devices()?)?;
         }
         log::info!("{}", opening::describe(&plan.rig_name(), &rig, &plan.input));
         let kinds = methods_of(&rig)?;
@@ -448,7 +442,7 @@ impl RunPlan {
         }
     }
 
-    /// Opens the devices or the recording. Also returns the arm or the base if it is steered.
+    /// Opens the devices or the recording. Also returns the parts of the robot that are steered.
     fn open(&self, rig: Rig) -> anyhow::Result<(Opened, Option<SteeredRobot>)> {
         let RunInput::Recording {
             path,
@@ -457,13 +451,9 @@ impl RunPlan {
         } = &self.input
         else {
             let devices = self.devices()?;
-            if self.is_steered && open::is_base_steered(&rig, devices) {
-                let (opened, base) = open::with_steered_base(rig, devices)?;
-                return Ok((opened, Some(SteeredRobot::Base(base))));
-            }
             if self.is_steered {
-                let (opened, arm) = open::steered(rig, devices)?;
-                return Ok((opened, Some(SteeredRobot::Arm(arm))));
+                let (opened, robot) = open::with_steered_robot(rig, devices)?;
+                return Ok((opened, Some(robot)));
             }
             return Ok((open::rig(rig, devices)?, None));
         };

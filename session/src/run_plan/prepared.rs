@@ -10,11 +10,11 @@ use crate::robot_meshes;
 use crate::run_folder::CreatedFolders;
 use crate::session::{Evaluators, Session};
 use crate::session_setup::{Services, SessionSetup};
-use crate::steering::{PreparedRobot, SteeredRobot};
+use crate::steering::PreparedSteering;
 use crate::training_clock::Clock;
 use crate::viewers::{Viewers, gpu_notes};
 use capture::config::Rig;
-use capture::open::{self, Opened};
+use capture::open::{self, Opened, SteeredRobot};
 use capture::{
     Feed, Input, InputObserver, Join, Notes, RecordedMeshes, RobotMotion, StampClock, Stations,
     doctor,
@@ -47,7 +47,7 @@ pub struct PreparedRun<'a> {
 /// A run whose devices are open.
 pub struct OpenedRun<'a> {
     opened: Opened,
-    /// The arm or the base, if operators may steer it.
+    /// The parts of the robot that operators may steer, if they may.
     steered: Option<SteeredRobot>,
     /// Mesh files of the robot; `None` if the run is not recorded.
     meshes: Option<RecordedMeshes>,
@@ -180,11 +180,11 @@ impl OpenedRun<'_> {
         input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig)?;
         let steering = steered
-            .map(|robot| PreparedRobot::new(robot, &rig))
+            .map(|robot| PreparedSteering::new(robot, &rig))
             .transpose()?;
         let identity = identity(&plan, &folders, robot);
         let stop = services.stop.clone();
-        let clearance = steering.as_ref().and_then(PreparedRobot::clearance_feed);
+        let clearance = steering.as_ref().and_then(PreparedSteering::clearance_feed);
         let feed = Feed::start(input, observer(&hub, steering.as_ref()), stop.clone())?;
         let steering = steering
             .map(|steering| steering.start(&hub, Some(run_folder_of(&folders))))
@@ -251,10 +251,10 @@ impl OpenedRun<'_> {
 }
 
 /// What receives the data of the devices besides the trainer.
-fn observer(hub: &Hub, steering: Option<&PreparedRobot>) -> Box<dyn InputObserver> {
+fn observer(hub: &Hub, steering: Option<&PreparedSteering>) -> Box<dyn InputObserver> {
     let viewers = Viewers(hub.clone());
     match steering {
-        Some(steering) => steering.observer(viewers),
+        Some(steering) => Box::new(steering.observer(viewers)),
         None => Box::new(viewers),
     }
 }

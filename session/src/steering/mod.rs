@@ -1,17 +1,16 @@
-//! Lets operators steer the arm of a run.
+//! Lets operators steer the robot of a run: its arm, its base, or both.
 //!
 //! A separate thread takes the requests of the clients of `/steer` ([`SteeringServer`]), decides
-//! with the chain of the crate `steering` what the arm does, and sends it to the arm's own thread,
-//! which brakes as soon as targets expire. The thread needs neither the trainer nor the GPU, so
-//! both may be busy for any time. `steering_loop.rs` has one cycle, and the other files its parts.
-//! The folder `base` does the same for a base.
+//! with the chain of the crate `steering` what the robot does, and sends it to the own threads of
+//! its arm and its base, which brake as soon as targets expire. The thread needs neither the trainer
+//! nor the GPU, so both may be busy for any time. `steering_loop.rs` has one cycle, and the other
+//! files its parts. The folder `base` has what only bases need.
 
 mod base;
 mod clearance_feed;
 mod followed_command;
 mod joint_map;
 mod observer;
-mod prepared_robot;
 mod previews;
 mod recovery;
 mod requests;
@@ -30,24 +29,27 @@ mod undrawn;
 
 pub(crate) use clearance_feed::{ClearanceFeed, MIN_STEPS};
 pub(crate) use observer::SteeringObserver;
-pub(crate) use prepared_robot::{PreparedRobot, SteeredRobot};
 pub use standalone::steer_standalone;
 pub use surroundings::Surroundings;
 
 use crate::viewers::Viewers;
 use anyhow::{Context, bail};
+use base::{PreparedBase, RobotWatch};
 use capture::config::{ArmSteering, Rig};
-use capture::open::SteeredArm;
+use capture::open::{SteeredArm, SteeredBase, SteeredRobot};
 use drivers::motion::ArmState;
-use scene_clearance::SceneClearance;
+use kinematics::Stamp;
+use observer::RobotObserver;
+use robot::ChainAndBody;
+use scene_clearance::{MovingBase, SceneClearance};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use steering::{LimitConfig, SteeringConfig};
+use steering::{Clearance, LeaseConfig, LimitConfig, Seen, SteeringConfig};
 use steering_log::About;
-use steering_loop::{Reply, SteeringLoop};
+use steering_loop::{Reply, Reports, SteeringLoop};
 use time_base::TimeBase;
 use viz::{ArmDescription, Hub, SteeredJoint, SteeringServer};
 
@@ -59,54 +61,140 @@ const MIN_PERIOD: Duration = Duration::from_millis(2);
 /// Maximum time until an enabled arm reports its state for the first time.
 const MAX_FIRST_REPORT: Duration = Duration::from_secs(5);
 
-/// The steered arm of a run, before its input is read.
+/// The steered robot of a run, before its input is read.
 pub(crate) struct PreparedSteering<S = SceneClearance> {
+    arm: Option<PreparedArm>,
+    base: Option<PreparedBase>,
+    base_link: String,
+    tip_link: String,
+    watch: Arc<RobotWatch>,
+    /// What is known about the space around the robot; `None` if nothing is asked about it.
+    scene: Option<Arc<S>>,
+    about: About,
+}
+
+/// The arm of a robot, before its input is read.
+struct PreparedArm {
     arm: SteeredArm,
-    robot: robot::ChainAndBody,
-    scene: Arc<S>,
+    robot: ChainAndBody,
     config: SteeringConfig,
     servo_round_trip_millis: f64,
     joint_names: Vec<String>,
     joint_offsets: Vec<f64>,
-    about: About,
 }
 
 impl PreparedSteering {
-    /// Prepares the arm of a rig for its operators.
+    /// Prepares the robot of a rig for its operators.
     ///
     /// # Errors
     ///
-    /// If the robot description has no shapes, because nothing would then protect the robot.
-    pub(crate) fn new(arm: SteeredArm, rig: &Rig) -> anyhow::Result<Self> {
-        let robot = robot::chain_and_body(rig)?;
-        let scene = Arc::new(SceneClearance::new(rig, &robot)?);
-        Ok(Self::of(arm, rig, robot, scene))
+    /// If the robot description has no shapes, because nothing would then protect the robot, or the
+    /// footprint of its base is not known.
+    pub(crate) fn new(steered: SteeredRobot, rig: &Rig) -> anyhow::Result<Self> {
+        let watch = Arc::new(RobotWatch::new(TimeBase::now()));
+        let SteeredRobot { arm, base } = steered;
+        // A base needs shapes only for its footprint, which the rig file may give instead.
+        let robot = match robot::chain_and_body(rig) {
+            Ok(robot) => Some(robot),
+            Err(error) if arm.is_some() => return Err(error),
+            Err(error) => {
+                log::debug!("steering: {error:#}");
+                None
+            }
+        };
+        let prepare = |base| PreparedBase::new(base, rig, robot.as_ref(), arm.is_some());
+        let base = base.map(prepare).transpose()?;
+        let in_map = base.as_ref().and_then(|base| base.in_map.as_ref());
+        let moving = in_map.map(|in_map| MovingBase {
+            in_map,
+            watch: Arc::clone(&watch),
+        });
+        let scene = if arm.is_some() || moving.is_some() {
+            Some(Arc::new(SceneClearance::new(rig, robot.as_ref(), moving)?))
+        } else {
+            None
+        };
+        Ok(Self {
+            arm: arm
+                .zip(robot)
+                .map(|(arm, robot)| PreparedArm::new(arm, rig, robot)),
+            base,
+            watch,
+            scene,
+            ..Self::of(rig)
+        })
     }
 
-    /// An observer of the run's input, from which the free space around the arm is known. It also
-    /// passes everything on to viewers.
+    /// An observer of the run's input, from which the robot and the free space around it are known.
+    /// It also passes everything on to viewers.
     pub(crate) fn observer(&self, viewers: Viewers) -> SteeringObserver {
-        SteeringObserver::new(viewers, Arc::<SceneClearance>::clone(&self.scene))
+        // The place of the base is needed before what is seen from there.
+        let mut parts: Vec<Arc<dyn RobotObserver>> = vec![Arc::<RobotWatch>::clone(&self.watch)];
+        if let Some(scene) = &self.scene {
+            parts.push(Arc::<SceneClearance>::clone(scene));
+        }
+        SteeringObserver::new(viewers, parts)
     }
 
     /// Passes depth that the live model draws to the map of free space.
-    pub(crate) fn clearance_feed(&self) -> ClearanceFeed {
-        ClearanceFeed::new(Arc::clone(&self.scene))
+    pub(crate) fn clearance_feed(&self) -> Option<ClearanceFeed> {
+        let scene = self.scene.as_ref()?;
+        Some(ClearanceFeed::new(Arc::clone(scene)))
     }
 }
 
-impl<S: Surroundings> PreparedSteering<S> {
-    fn of(arm: SteeredArm, rig: &Rig, robot: robot::ChainAndBody, scene: Arc<S>) -> Self {
+impl PreparedArm {
+    fn new(arm: SteeredArm, rig: &Rig, robot: ChainAndBody) -> Self {
         let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
         let settings = settings.cloned().unwrap_or_default();
         Self {
             arm,
             robot,
-            scene,
             config: config(&settings),
             servo_round_trip_millis: settings.servo_round_trip_millis,
             joint_names: rig.arm.joints.clone(),
             joint_offsets: rig.arm.joint_offsets.clone(),
+        }
+    }
+
+    fn start(&self, times: TimeBase) -> anyhow::Result<(SteeringLoop, Vec<SteeredJoint>)> {
+        let first = first_report(&self.arm)?;
+        let robot = self
+            .robot
+            .steered(&self.joint_names, &self.joint_offsets, &self.arm)?;
+        let joints = self.joints(&robot);
+        let steering_loop = SteeringLoop::new(self.config.clone(), robot, times, &first)
+            .context("the arm cannot be steered")?;
+        Ok((steering_loop, joints))
+    }
+
+    fn joints(&self, robot: &steering_loop::SteeredRobot) -> Vec<SteeredJoint> {
+        let limits = robot.joints.limits_in_chain(robot.port.limits());
+        let names = robot.chain.joint_names().iter();
+        let joints = names.zip(&limits).zip(&self.robot.is_prismatic);
+        let finite = |bound: f64| bound.is_finite().then_some(bound);
+        joints
+            .map(|((name, limits), is_prismatic)| SteeredJoint {
+                name: name.clone(),
+                lower: finite(limits.position[0]),
+                upper: finite(limits.position[1]),
+                is_prismatic: *is_prismatic,
+                velocity: limits.velocity,
+            })
+            .collect()
+    }
+}
+
+impl<S: Surroundings> PreparedSteering<S> {
+    /// A robot without steered parts.
+    fn of(rig: &Rig) -> Self {
+        Self {
+            arm: None,
+            base: None,
+            base_link: rig.arm.base_link.clone(),
+            tip_link: rig.arm.flange_link.clone(),
+            watch: Arc::new(RobotWatch::new(TimeBase::now())),
+            scene: None,
             about: About {
                 urdf: rig.arm.urdf_text.clone(),
                 world_from_base: rig.base.world_from_base,
@@ -114,25 +202,21 @@ impl<S: Surroundings> PreparedSteering<S> {
         }
     }
 
-    /// Lets clients of the hub steer the arm.
+    /// Lets clients of the hub steer the robot.
     ///
     /// * `log_folder`: where all decisions are logged, if they are.
     ///
     /// # Errors
     ///
-    /// If the arm reports nothing, its limits do not match the robot, or no thread can be started.
+    /// If the arm reports nothing, its limits do not match the robot, the configuration of the base
+    /// is not valid, or no thread can be started.
     pub(crate) fn start(
         self,
         hub: &Hub,
         log_folder: Option<&Path>,
     ) -> anyhow::Result<SteeringThread> {
-        let first = first_report(&self.arm)?;
-        let robot = self
-            .robot
-            .steered(&self.joint_names, &self.joint_offsets, &self.arm)?;
-        let server = SteeringServer::new(self.description(&robot));
-        let mut steering_loop = SteeringLoop::new(self.config, robot, TimeBase::now(), &first)
-            .context("the arm cannot be steered")?;
+        let (mut steering_loop, joints) = self.start_loop()?;
+        let server = SteeringServer::new(self.description(joints));
         if let Some(folder) = log_folder {
             steering_loop
                 .log_into(folder, self.about)
@@ -141,7 +225,9 @@ impl<S: Surroundings> PreparedSteering<S> {
         let must_stop = Arc::new(AtomicBool::new(false));
         let running = Running {
             steering_loop,
-            arm: self.arm,
+            arm: self.arm.map(|arm| arm.arm),
+            base: self.base,
+            watch: self.watch,
             scene: self.scene,
             server: Arc::clone(&server),
             must_stop: Arc::clone(&must_stop),
@@ -157,30 +243,50 @@ impl<S: Surroundings> PreparedSteering<S> {
         })
     }
 
-    fn description(&self, robot: &steering_loop::SteeredRobot) -> ArmDescription {
-        let limits = robot.joints.limits_in_chain(robot.port.limits());
-        let names = robot.chain.joint_names().iter();
-        let joints = names.zip(&limits).zip(&self.robot.is_prismatic);
-        let finite = |bound: f64| bound.is_finite().then_some(bound);
+    fn start_loop(&self) -> anyhow::Result<(SteeringLoop, Vec<SteeredJoint>)> {
+        let times = self.watch.times();
+        let base = self.base.as_ref();
+        let base = base.map(|base| (base.config.clone(), base.base.port().clone()));
+        match (&self.arm, base) {
+            (Some(arm), None) => arm.start(times),
+            (Some(arm), Some((config, port))) => {
+                let (steering_loop, joints) = arm.start(times)?;
+                let steering_loop = steering_loop.with_base(config, port);
+                Ok((steering_loop.context(BASE_REFUSED)?, joints))
+            }
+            (None, Some((config, port))) => {
+                let steering_loop = SteeringLoop::of_base(config, port, times);
+                Ok((steering_loop.context(BASE_REFUSED)?, Vec::new()))
+            }
+            (None, None) => bail!("no part of the robot is steered: this is a bug"),
+        }
+    }
+
+    fn description(&self, joints: Vec<SteeredJoint>) -> ArmDescription {
+        let config = match (&self.arm, &self.base) {
+            (Some(arm), _) => (arm.config.clutch, arm.config.lease),
+            (None, Some(base)) => (base.config.clutch, base.config.lease),
+            (None, None) => Default::default(),
+        };
+        let (clutch, lease): (steering::ClutchConfig, LeaseConfig) = config;
         ArmDescription {
-            base_link: robot.chain.base_link().to_owned(),
-            tip_link: robot.chain.tip_link().to_owned(),
-            joints: joints
-                .map(|((name, limits), is_prismatic)| SteeredJoint {
-                    name: name.clone(),
-                    lower: finite(limits.position[0]),
-                    upper: finite(limits.position[1]),
-                    is_prismatic: *is_prismatic,
-                    velocity: limits.velocity,
-                })
-                .collect(),
-            expiry_secs: self.config.clutch.max_silence_secs,
-            lease_secs: self.config.lease.expiry_secs,
-            servo_round_trip_millis: self.servo_round_trip_millis,
-            base: None,
+            base_link: self.base_link.clone(),
+            tip_link: self.tip_link.clone(),
+            joints,
+            expiry_secs: clutch.max_silence_secs,
+            lease_secs: lease.expiry_secs,
+            // Velocities of a base need no preview, whatever the round trip.
+            servo_round_trip_millis: self
+                .arm
+                .as_ref()
+                .map_or(f64::from(u16::MAX), |arm| arm.servo_round_trip_millis),
+            base: self.base.as_ref().map(PreparedBase::description),
         }
     }
 }
+
+/// Context of errors in the configuration of a base.
+const BASE_REFUSED: &str = "the base cannot be driven";
 
 /// The configuration of the chain of decisions.
 fn config(settings: &ArmSteering) -> SteeringConfig {
@@ -249,11 +355,22 @@ impl Drop for Admission {
 /// What the thread owns.
 struct Running<S> {
     steering_loop: SteeringLoop,
-    arm: SteeredArm,
-    scene: Arc<S>,
+    arm: Option<SteeredArm>,
+    base: Option<PreparedBase>,
+    watch: Arc<RobotWatch>,
+    scene: Option<Arc<S>>,
     server: Arc<SteeringServer>,
     must_stop: Arc<AtomicBool>,
     _admission: Admission,
+}
+
+/// For a base that nobody keeps away from the scene.
+struct NoScene;
+
+impl Clearance for NoScene {
+    fn readings(&self, _points_in_base: &[[f64; 3]], _now: Stamp) -> Vec<Option<Seen>> {
+        Vec::new()
+    }
 }
 
 impl<S: Surroundings> Running<S> {
@@ -270,19 +387,32 @@ impl<S: Surroundings> Running<S> {
     }
 
     fn decide(&mut self) {
-        // The first report came before the thread was started.
-        let Some(arm) = self.steering_loop.arm() else {
-            return;
-        };
-        self.scene.set_posture(&arm);
         let received = self.server.take_requests();
+        if let Some(base) = &self.base {
+            base.report_to(&self.watch);
+        }
+        let reports = Reports {
+            // The first report came before the thread was started.
+            arm: self.steering_loop.arm(),
+            robot: self.watch.seen(),
+        };
+        if let Some(scene) = &self.scene {
+            match &reports.arm {
+                Some(arm) => scene.set_posture(arm),
+                None => scene.set_base(),
+            }
+        }
         let now = drivers::clock::now();
-        let outcome = self.steering_loop.cycle(now, &received, &arm, &*self.scene);
-        if outcome.begins {
-            self.scene.end_sweep();
+        let scene: &dyn Clearance = match &self.scene {
+            Some(scene) => &**scene,
+            None => &NoScene,
+        };
+        let outcome = self.steering_loop.cycle(now, &received, &reports, scene);
+        if let Some(scene) = self.scene.as_ref().filter(|_| outcome.begins) {
+            scene.end_sweep();
         }
         if outcome.begins || outcome.ends_tour {
-            self.arm.begin();
+            self.begin();
         }
         for (client, reply) in outcome.replies {
             match reply {
@@ -291,8 +421,29 @@ impl<S: Surroundings> Running<S> {
             }
         }
         if let Some(mut state) = outcome.state {
-            state.contacts = self.arm.n_contacts();
+            state.contacts = self.n_contacts();
             self.server.publish(state);
         }
+    }
+
+    /// Takes all parts of the robot over, or stops them.
+    fn begin(&self) {
+        if let Some(arm) = &self.arm {
+            arm.begin();
+        }
+        if let Some(base) = &self.base {
+            base.base.begin();
+        }
+    }
+
+    /// All parts of a simulated robot share one count.
+    fn n_contacts(&self) -> Option<u64> {
+        let of_arm = self.arm.as_ref().and_then(SteeredArm::n_contacts);
+        let of_base = || {
+            self.base
+                .as_ref()
+                .and_then(|it| SteeredBase::n_contacts(&it.base))
+        };
+        of_arm.or_else(of_base)
     }
 }

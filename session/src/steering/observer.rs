@@ -14,6 +14,9 @@ pub(super) trait RobotObserver: Send + Sync {
 
     /// Receives a keyframe when it is accepted.
     fn observe_keyframe(&self, _keyframe: &Arc<Keyframe>) {}
+
+    /// Receives a scan of a range scanner.
+    fn observe_range_scan(&self, _scan: &RangeScan) {}
 }
 
 impl RobotObserver for SceneClearance {
@@ -24,17 +27,22 @@ impl RobotObserver for SceneClearance {
     fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
         Self::observe_keyframe(self, keyframe);
     }
+
+    fn observe_range_scan(&self, scan: &RangeScan) {
+        Self::observe_range_scan(self, scan);
+    }
 }
 
 /// An observer of a run's input whose robot is steered.
 pub(crate) struct SteeringObserver {
     viewers: Viewers,
-    robot: Arc<dyn RobotObserver>,
+    /// In the order in which they receive a state of the robot.
+    parts: Vec<Arc<dyn RobotObserver>>,
 }
 
 impl SteeringObserver {
-    pub(super) fn new(viewers: Viewers, robot: Arc<dyn RobotObserver>) -> Self {
-        Self { viewers, robot }
+    pub(super) fn new(viewers: Viewers, parts: Vec<Arc<dyn RobotObserver>>) -> Self {
+        Self { viewers, parts }
     }
 }
 
@@ -53,18 +61,25 @@ impl InputObserver for SteeringObserver {
     }
 
     fn observe_robot(&self, state: RobotState) {
-        self.robot.observe_robot(&state);
+        for part in &self.parts {
+            part.observe_robot(&state);
+        }
         if self.viewers.needs_robot() {
             self.viewers.observe_robot(state);
         }
     }
 
     fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
-        self.robot.observe_keyframe(keyframe);
+        for part in &self.parts {
+            part.observe_keyframe(keyframe);
+        }
         self.viewers.observe_keyframe(keyframe);
     }
 
     fn observe_range_scan(&self, scan: RangeScan) {
+        for part in &self.parts {
+            part.observe_range_scan(&scan);
+        }
         self.viewers.observe_range_scan(scan);
     }
 }

@@ -3,7 +3,7 @@
 use super::time_base::TimeBase;
 use steering::{Command, Device, Effect, Intent, Limit, Link, Operator};
 use viz::{AppliedLimit, LimitEffect, LimitLink, RefusedRequest, SteeringCommand, SteeringIntent};
-use viz::{ReceivedRequest, SteeringRequest};
+use viz::{ReceivedRequest, SteeredPart, SteeringRequest};
 
 /// A command of a client, which has arrived with a request.
 ///
@@ -78,7 +78,9 @@ pub(super) fn kind(request: &SteeringRequest) -> Option<RefusedRequest> {
 }
 
 /// A limit as clients receive it.
-pub(super) fn applied_limit(limit: &Limit) -> AppliedLimit {
+///
+/// * `part`: the part of the robot on which it acts.
+pub(super) fn applied_limit(limit: &Limit, part: SteeredPart) -> AppliedLimit {
     let (effect, speed_scale) = match limit.effect {
         Effect::Slowed(scale) => (LimitEffect::Slowed, scale),
         Effect::Refused => (LimitEffect::Refused, 0.0),
@@ -94,6 +96,7 @@ pub(super) fn applied_limit(limit: &Limit) -> AppliedLimit {
         Link::Base => LimitLink::Base,
     };
     AppliedLimit {
+        part,
         link,
         effect,
         speed_scale,

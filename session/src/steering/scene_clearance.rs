@@ -1,23 +1,28 @@
-//! What is known about the space around the arm of a run: the map of free space, and what feeds it.
+//! What is known about the space around the robot of a run: the map of free space, and what feeds
+//! it.
 //!
 //! Keyframes with measured depth show what is free and what is not; for the others, the live model
-//! draws depth (`clearance_feed.rs`). Before the first operator, the
+//! draws depth (`clearance_feed.rs`). Scans of range scanners show the same. Before the first operator, the
 //! space through which the arm itself moves is free, too, with the margin that the rig file permits:
 //! a person guides it, or a simulated arm is on its tour.
 
+use super::base::RobotWatch;
 use super::robot::ChainAndBody;
 use super::undrawn::UndrawnKeyframes;
 use capture::config::Rig;
 use capture::open;
-use clearance_map::{ClearanceMap, DepthImage, DepthOrigin, MapConfig, Posture, reach_m};
+use clearance_map::{
+    ClearanceMap, DepthImage, DepthOrigin, MapBase, MapConfig, Posture, images_of_scan, reach_m,
+};
 use drivers::motion::ArmState;
-use keyframe::{Keyframe, RobotState};
+use keyframe::{Keyframe, RangeScan, RobotState};
 use kinematics::{JointHistory, JointState, Stamp, Transform};
+use nalgebra::Point3;
 use parking_lot::Mutex;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use steering::{Clearance, Seen};
+use steering::{Body, Clearance, Footprint, Seen};
 
 /// Postures are not interpolated across longer gaps.
 const MAX_GAP: Duration = Duration::from_millis(100);
@@ -34,12 +39,22 @@ const MAX_SWEPT: usize = 1000;
 /// Margin of swept space in simulations, meters. Their tours keep this distance from the scene.
 const SIMULATED_MARGIN_M: f64 = 0.15;
 
-/// The space around an arm.
+/// Distance from a base up to which its surroundings are in the map, meters, besides its footprint:
+/// a base at 0.6 m/s stops within 0.8 m.
+const BASE_REACH_M: f64 = 1.2;
+/// Minimum time between two scans of a scanner that are used, seconds: each one is four images.
+const SCAN_PERIOD_SECS: f64 = 0.2;
+/// Change of the correction of base poses after which the map is outdated, meters and radians.
+/// Smaller changes are within the distances that the robot keeps.
+const MAX_SHIFT_M: f64 = 0.05;
+const MAX_SHIFT_RAD: f64 = 0.05;
+
+/// The space around a robot.
 pub(crate) struct SceneClearance {
     map: ClearanceMap,
     /// Index in the lists of the rig file of each joint of the chain.
     joint_ixs: Vec<usize>,
-    world_from_base: Transform,
+    place: Place,
     swept_margin_m: f64,
     state: Mutex<State>,
     undrawn: UndrawnKeyframes,
@@ -48,7 +63,26 @@ pub(crate) struct SceneClearance {
 struct State {
     /// Postures in the order of the chain.
     postures: JointHistory,
+    /// The newest one; empty before the first one.
+    newest_position: Vec<f64>,
     sweep: Sweep,
+    /// Time of the last scan of each scanner.
+    scanned: BTreeMap<Arc<str>, Stamp>,
+    /// The last correction of base poses.
+    map_from_odom: Option<Transform>,
+}
+
+/// Where the base of the robot is.
+enum Place {
+    /// The base does not move.
+    Fixed(Transform),
+    Moving(Arc<RobotWatch>),
+}
+
+/// A base in the map, and the newest reports about it.
+pub(super) struct MovingBase<'a> {
+    pub(super) in_map: &'a MapBase,
+    pub(super) watch: Arc<RobotWatch>,
 }
 
 /// The times of the postures that have shown free space.
@@ -61,12 +95,19 @@ struct Sweep {
 }
 
 impl SceneClearance {
-    /// The space around the arm of a rig with a fixed base, of which nothing is known.
+    /// The space around the robot of a rig, of which nothing is known.
+    ///
+    /// * `robot`: its chain and its shapes; `None` for a base of which only the footprint is known.
+    /// * `base`: the base, if it is steered.
     ///
     /// # Errors
     ///
     /// If the reach of the robot is too large for a map, or no thread can be started.
-    pub(super) fn new(rig: &Rig, robot: &ChainAndBody) -> anyhow::Result<Self> {
+    pub(super) fn new(
+        rig: &Rig,
+        robot: Option<&ChainAndBody>,
+        base: Option<MovingBase<'_>>,
+    ) -> anyhow::Result<Self> {
         let settings = rig.arm.motion.as_ref().map(|motion| &motion.steering);
         let permitted_m = settings.map_or(0.0, |settings| settings.swept_margin_m);
         let swept_margin_m = if open::is_any_simulated(rig) {
@@ -74,15 +115,32 @@ impl SceneClearance {
         } else {
             permitted_m
         };
-        let config = MapConfig::for_reach(reach_m(&robot.body, &robot.chain));
+        let footprint = base.as_ref().map(|base| &base.in_map.footprint);
+        let body = body(rig, robot, footprint);
+        let of_arm_m: f64 = robot.map_or(0.0, |robot| reach_m(&robot.body, &robot.chain));
+        let of_base_m = footprint.map_or(0.0, |it| it.radius_m() + BASE_REACH_M);
+        // Beyond the largest map, nothing is seen.
+        let reach_m = of_arm_m.max(of_base_m.min(MapConfig::max_reach_m()));
+        let config = MapConfig::for_reach(reach_m);
+        let map = match &base {
+            Some(base) => ClearanceMap::start_with_base(&config, body, base.in_map)?,
+            None => ClearanceMap::start(&config, body)?,
+        };
+        let joint_ixs = robot.map(|robot| robot.chain.order_in(&rig.arm.joints));
         Ok(Self {
-            map: ClearanceMap::start(&config, robot.body.clone())?,
-            joint_ixs: robot.chain.order_in(&rig.arm.joints)?,
-            world_from_base: rig.base.world_from_base,
+            map,
+            joint_ixs: joint_ixs.transpose()?.unwrap_or_default(),
+            place: match base {
+                Some(base) => Place::Moving(base.watch),
+                None => Place::Fixed(rig.base.world_from_base),
+            },
             swept_margin_m,
             state: Mutex::new(State {
                 postures: JointHistory::new(MAX_GAP, MAX_POSTURES),
+                newest_position: Vec::new(),
                 sweep: Sweep::default(),
+                scanned: BTreeMap::new(),
+                map_from_odom: None,
             }),
             undrawn: UndrawnKeyframes::default(),
         })
@@ -90,10 +148,34 @@ impl SceneClearance {
 
     /// Sets where the arm is now, in the order of the chain.
     pub(super) fn set_posture(&self, arm: &ArmState) {
-        let posture = self.posture(arm.reported_at, arm.position.clone());
-        let is_due = self.state.lock().sweep.takes_report(arm.reported_at);
+        self.set_robot(arm.reported_at, &arm.position);
+    }
+
+    /// Sets where a base without a steered arm is now.
+    pub(super) fn set_base(&self) {
+        let Place::Moving(watch) = &self.place else {
+            return;
+        };
+        let Some((at, _)) = watch.newest_pose() else {
+            return;
+        };
+        // An arm that is not steered is where the input has reported it last.
+        let position = self.state.lock().newest_position.clone();
+        self.set_robot(at, &position);
+    }
+
+    fn set_robot(&self, at: Stamp, position: &[f64]) {
+        let Some(world_from_base) = self.newest_base(at) else {
+            return;
+        };
+        let posture = Posture {
+            stamp: at,
+            position: position.to_vec(),
+            world_from_base,
+        };
+        let is_due = self.state.lock().sweep.takes_report(at);
         let result = self.map.set_posture(&posture).and_then(|()| {
-            // The arm reports its state also while the input waits for a busy trainer.
+            // The robot reports its state also while the input waits for a busy trainer.
             if is_due {
                 self.map.sweep(posture, self.swept_margin_m)
             } else {
@@ -106,13 +188,14 @@ impl SceneClearance {
         }
     }
 
-    /// From now on, an operator moves the arm, so that its own way proves nothing any more.
+    /// From now on, an operator moves the robot, so that its own way proves nothing any more.
     pub(super) fn end_sweep(&self) {
         self.state.lock().sweep.end();
     }
 
-    /// Takes a reading of the joints.
+    /// Takes a reading of the joints and of the base.
     pub(super) fn observe_robot(&self, robot: &RobotState) {
+        self.note_correction();
         let of_chain = |ix: &usize| robot.positions.get(*ix).copied();
         let Some(position) = self
             .joint_ixs
@@ -123,10 +206,16 @@ impl SceneClearance {
             return;
         };
         let mut state = self.state.lock();
-        let swept = state
-            .sweep
-            .takes_reading(robot.stamp)
-            .then(|| self.posture(robot.stamp, position.clone()));
+        let is_due = state.sweep.takes_reading(robot.stamp);
+        let swept = is_due.then(|| Posture {
+            stamp: robot.stamp,
+            position: position.clone(),
+            world_from_base: match &self.place {
+                Place::Fixed(world_from_base) => *world_from_base,
+                Place::Moving(_) => robot.world_from_base,
+            },
+        });
+        state.newest_position.clone_from(&position);
         // Readings that are not later than the last one are counted by the history.
         let _ = state.postures.push(JointState {
             stamp: robot.stamp,
@@ -142,13 +231,39 @@ impl SceneClearance {
         }
     }
 
+    /// Takes a scan of a range scanner.
+    pub(super) fn observe_range_scan(&self, live: &RangeScan) {
+        let scan = &live.scan;
+        {
+            let mut state = self.state.lock();
+            let last = state.scanned.get(&scan.scanner);
+            if last.is_some_and(|last| scan.stamp.secs_since(*last) < SCAN_PERIOD_SECS) {
+                return;
+            }
+            state.scanned.insert(Arc::clone(&scan.scanner), scan.stamp);
+        }
+        let Some(posture) = self.posture_at(scan.stamp) else {
+            log::debug!("steering: no posture at the time of a scan");
+            return;
+        };
+        let corrected = |point: &[f32; 3]| {
+            let point = Point3::from(point.map(f64::from));
+            (live.map_from_odom * point).into()
+        };
+        let points: Vec<[f64; 3]> = scan.points_in_world_m.iter().map(corrected).collect();
+        let world_from_scanner = live.map_from_odom * scan.world_from_scanner;
+        let name = format!("scanner {}", scan.scanner);
+        for image in images_of_scan(&name, &world_from_scanner, &points, &posture) {
+            self.observe_depth(image);
+        }
+    }
+
     /// Takes a keyframe. If most of its pixels have no depth, it waits for that of the model.
     pub(super) fn observe_keyframe(&self, keyframe: &Keyframe) {
-        let Ok(joints) = self.state.lock().postures.at(keyframe.stamp) else {
+        let Some(posture) = self.posture_at(keyframe.stamp) else {
             log::debug!("steering: no posture at the time of a keyframe");
             return;
         };
-        let posture = self.posture(keyframe.stamp, joints.position);
         if keyframe.lacks_dense_depth() {
             self.undrawn.push(keyframe, posture.clone(), Instant::now());
         }
@@ -180,11 +295,74 @@ impl SceneClearance {
         }
     }
 
-    fn posture(&self, stamp: Stamp, position: Vec<f64>) -> Posture {
-        Posture {
+    /// Posture and place of the robot at a time of the past.
+    fn posture_at(&self, stamp: Stamp) -> Option<Posture> {
+        let position = if self.joint_ixs.is_empty() {
+            Vec::new()
+        } else {
+            self.state.lock().postures.at(stamp).ok()?.position
+        };
+        Some(Posture {
             stamp,
             position,
-            world_from_base: self.world_from_base,
+            world_from_base: match &self.place {
+                Place::Fixed(world_from_base) => *world_from_base,
+                Place::Moving(watch) => watch.world_from_base(stamp)?,
+            },
+        })
+    }
+
+    /// Place of the base at a time that may be later than its last report.
+    fn newest_base(&self, at: Stamp) -> Option<Transform> {
+        match &self.place {
+            Place::Fixed(world_from_base) => Some(*world_from_base),
+            Place::Moving(watch) => {
+                let newest = || {
+                    watch
+                        .newest_pose()
+                        .map(|(_, world_from_base)| world_from_base)
+                };
+                watch.world_from_base(at).or_else(newest)
+            }
+        }
+    }
+
+    /// Forgets the map if the correction of base poses has changed by more than the distances that
+    /// the robot keeps.
+    fn note_correction(&self) {
+        let Place::Moving(watch) = &self.place else {
+            return;
+        };
+        let Some(newest) = watch.map_from_odom() else {
+            return;
+        };
+        let before = self.state.lock().map_from_odom.replace(newest);
+        let Some(before) = before else {
+            return;
+        };
+        let shift = before.inverse() * newest;
+        let is_large =
+            shift.translation.vector.norm() > MAX_SHIFT_M || shift.rotation.angle() > MAX_SHIFT_RAD;
+        if is_large {
+            log::warn!(
+                "steering: the pose of the base was corrected by {:.2} m, so the map of free space begins anew",
+                shift.translation.vector.norm()
+            );
+            self.map.forget();
+        } else {
+            // Small corrections add up, so they are compared with the first one.
+            self.state.lock().map_from_odom = Some(before);
+        }
+    }
+}
+
+/// The shape of the robot in the map.
+fn body(rig: &Rig, robot: Option<&ChainAndBody>, footprint: Option<&Footprint>) -> Body {
+    match (robot, footprint) {
+        (Some(robot), _) => robot.body.clone(),
+        (None, footprint) => {
+            let capsules = footprint.map_or(Vec::new(), Footprint::capsules);
+            Body::of_base(&rig.arm.base_link, &capsules)
         }
     }
 }
@@ -231,6 +409,10 @@ impl Clearance for SceneClearance {
         self.map.readings(points_in_base, now)
     }
 
+    fn base_readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        self.map.base_readings(points_in_base, now)
+    }
+
     fn failure(&self) -> Option<String> {
         self.map.failure()
     }
@@ -254,7 +436,7 @@ mod tests {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&file, &[]).expect("a rig of this repository");
         let robot = chain_and_body(&rig).expect("its shapes are in the URDF");
-        let scene = SceneClearance::new(&rig, &robot).expect("a map of its reach");
+        let scene = SceneClearance::new(&rig, Some(&robot), None).expect("a map of its reach");
         let base_from_tip = robot.chain.forward(&START).expect("seven joints");
         let tip = base_from_tip.translation;
         (scene, [tip.x, tip.y + 0.1, tip.z])

@@ -1,7 +1,7 @@
 //! Steers an arm without a run.
 
 use super::surroundings::Surroundings;
-use super::{PreparedSteering, SteeringThread, robot};
+use super::{PreparedArm, PreparedSteering, SteeringThread, robot};
 use capture::config::Rig;
 use capture::open::SteeredArm;
 use drivers::motion::SteeringPort;
@@ -26,6 +26,10 @@ pub fn steer_standalone<S: Surroundings>(
     hub: &Hub,
 ) -> anyhow::Result<SteeringThread> {
     let robot = robot::chain_and_body(rig)?;
-    let prepared = PreparedSteering::of(SteeredArm::holding(port), rig, robot, scene);
+    let prepared = PreparedSteering {
+        arm: Some(PreparedArm::new(SteeredArm::holding(port), rig, robot)),
+        scene: Some(scene),
+        ..PreparedSteering::of(rig)
+    };
     prepared.start(hub, None)
 }

@@ -3,7 +3,7 @@
 use super::config;
 use super::joint_map::JointMap;
 use super::steering_log::{self, About};
-use super::steering_loop::{Outcome, Reply, SteeredRobot, SteeringLoop};
+use super::steering_loop::{Outcome, Reply, Reports, SteeredRobot, SteeringLoop};
 use super::test_arm::{PANDA, START, panda};
 use super::time_base::TimeBase;
 use capture::config::ArmSteering;
@@ -121,10 +121,13 @@ impl Run {
                 request,
             })
             .collect();
-        let arm = self.steering_loop.arm().expect("a report");
+        let reports = Reports {
+            arm: Some(self.steering_loop.arm().expect("a report")),
+            ..Reports::default()
+        };
         let outcome = self
             .steering_loop
-            .cycle(self.now, &received, &arm, &self.scene);
+            .cycle(self.now, &received, &reports, &self.scene);
         let state = outcome.state.as_ref();
         self.stop_number = state
             .and_then(|state| state.stop_number)
@@ -498,10 +501,13 @@ fn a_command_that_waited_in_the_inbox_does_not_look_fresh() {
     // The loop is late by less than the time after which the arm itself brakes.
     run.move_arm(80);
     run.scene.seen_at = run.now;
-    let arm = run.steering_loop.arm().expect("a report");
+    let reports = Reports {
+        arm: Some(run.steering_loop.arm().expect("a report")),
+        ..Reports::default()
+    };
     let outcome = run
         .steering_loop
-        .cycle(run.now, &[received], &arm, &run.scene);
+        .cycle(run.now, &[received], &reports, &run.scene);
     let followed = outcome.state.expect("a state");
     assert!(followed.target.is_some(), "{:?}", followed.limits);
     let mut braked = None;

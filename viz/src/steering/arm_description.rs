@@ -18,7 +18,7 @@ pub struct ArmDescription {
     /// Round trip from which on a page should show goals before the arm moves, instead of moving the
     /// arm with the hand.
     pub servo_round_trip_millis: f64,
-    /// The base, if it is steered. There are then no joints.
+    /// The base, if it is steered. Without a steered arm, there are no joints.
     pub base: Option<BaseDescription>,
 }
 
@@ -34,6 +34,24 @@ pub struct BaseDescription {
     /// Rectangle on the floor that the base stays in: smallest x and y, then largest x and y, in the
     /// world, meters.
     pub area_m: Option<[f64; 4]>,
+    /// What keeps the base away from obstacles.
+    pub avoidance: BaseAvoidance,
+    /// Joint values of the arm while the base moves, in the order of the joints; `None` without an
+    /// arm.
+    pub stowed: Option<Vec<f64>>,
+}
+
+/// What keeps a base away from obstacles.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BaseAvoidance {
+    /// Nothing but its operator.
+    #[default]
+    Nothing,
+    /// It stops before surfaces that were seen, and enters space that was never seen.
+    SeenSurfaces,
+    /// It stops before everything that is not known to be free.
+    UnknownSpace,
 }
 
 /// A joint that an operator moves.

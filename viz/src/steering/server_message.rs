@@ -4,7 +4,7 @@ use crate::clock::ServerClock;
 use crate::steering::arm_description::ArmDescription;
 use crate::steering::preview::Preview;
 use crate::steering::request::RefusedRequest;
-use crate::steering::state::{AppliedLimit, SteeredBaseState, SteeringState};
+use crate::steering::state::{AppliedLimit, SteeredBaseState, SteeredPart, SteeringState};
 use crate::topics::operator_status::ConnectedClient;
 use axum::extract::ws::Message;
 use serde::Serialize;
@@ -48,6 +48,7 @@ pub(crate) struct StateMessage<'a> {
     stop_number: Option<u64>,
     is_recovering: bool,
     is_moving: bool,
+    moved_part: Option<SteeredPart>,
     position: &'a [f64],
     target: Option<&'a [f64]>,
     base_from_tip: [f64; 7],
@@ -84,6 +85,7 @@ impl<'a> SteeringMessage<'a> {
             stop_number: state.stop_number,
             is_recovering: state.is_recovering,
             is_moving: state.is_moving,
+            moved_part: state.moved_part,
             position: &state.position,
             target: state.target.as_deref(),
             base_from_tip: state.base_from_tip,

@@ -22,8 +22,10 @@ pub struct SteeringState {
     /// Whether the arm is being enabled after a fault. When this succeeds, motion is permitted,
     /// unless somebody stops the arm meanwhile.
     pub is_recovering: bool,
-    /// Whether the arm moves or brakes.
+    /// Whether the robot moves or brakes.
     pub is_moving: bool,
+    /// The part that the operator moves; `None` while no dead-man switch is held.
+    pub moved_part: Option<SteeredPart>,
     /// Position of each joint, radians or meters.
     pub position: Vec<f64>,
     /// The joint positions to which the arm moves, if it follows a target.
@@ -50,6 +52,8 @@ pub struct SteeredBaseState {
     pub world_from_base: Option<[f64; 3]>,
     /// Measured velocity: forward and left in m/s, and the yaw rate in rad/s.
     pub velocity: [f64; 3],
+    /// Whether the base moves or brakes.
+    pub is_moving: bool,
     /// The velocity that the base should have, if it follows an operator.
     pub target: Option<[f64; 3]>,
     /// The goal of the operator: x and y in meters, and the heading in radians, in the world.
@@ -58,10 +62,22 @@ pub struct SteeredBaseState {
     pub has_arrived: bool,
 }
 
-/// A limit that slows the arm down or keeps it from moving.
+/// A part of a robot that operators move.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SteeredPart {
+    /// The arm.
+    Arm,
+    /// The base.
+    Base,
+}
+
+/// A limit that slows the robot down or keeps it from moving.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct AppliedLimit {
-    /// What limits the arm.
+    /// The part that is limited.
+    pub part: SteeredPart,
+    /// What limits it.
     pub link: LimitLink,
     /// What it does.
     pub effect: LimitEffect,
@@ -69,7 +85,8 @@ pub struct AppliedLimit {
     pub speed_scale: f64,
     /// Why, in one sentence.
     pub text: String,
-    /// Where, meters in the frame of the arm's base; for limits of a base, in the world.
+    /// Where: for limits of the arm in the frame of its base, for limits of the base in the world,
+    /// meters.
     pub place: Option<[f64; 3]>,
 }
 

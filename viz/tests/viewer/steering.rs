@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use trainer::Picture;
 use viz::{
     AppliedCommand, AppliedLimit, LimitEffect, LimitLink, Preview, PreviewGoal, PreviewVerdict,
-    RefusedRequest, SteeringIntent, SteeringRequest, SteeringState, publish_steering,
+    RefusedRequest, SteeredPart, SteeringIntent, SteeringRequest, SteeringState, publish_steering,
 };
 
 /// Duration of a lease that a test waits for. The tests take the requests much faster.
@@ -241,9 +241,11 @@ fn states_have_all_fields_on_the_servers_clock() {
         lease_left_secs: Some(4.5),
         offered_to: Some(8),
         is_moving: true,
+        moved_part: Some(SteeredPart::Arm),
         target: Some(vec![0.5, 0.25]),
         base_from_target: Some([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         limits: vec![AppliedLimit {
+            part: SteeredPart::Arm,
             link: LimitLink::SelfCollision,
             effect: LimitEffect::Slowed,
             speed_scale: 0.25,
@@ -277,11 +279,11 @@ fn states_have_all_fields_on_the_servers_clock() {
     );
     let expected = json!({
         "type": "state", "time_micros": null, "holder": client.number(), "lease_left_secs": 4.5,
-        "offered_to": 8, "stop": null, "stop_number": null, "is_recovering": false, "is_moving": true, "position": vec![0.0; N_JOINTS],
+        "offered_to": 8, "stop": null, "stop_number": null, "is_recovering": false, "is_moving": true, "moved_part": "arm", "position": vec![0.0; N_JOINTS],
         "target": [0.5, 0.25], "base_from_tip": [0.4, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
         "base_from_target": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "limits": [{
-            "link": "self-collision", "effect": "slowed", "speed_scale": 0.25,
+            "part": "arm", "link": "self-collision", "effect": "slowed", "speed_scale": 0.25,
             "text": "the elbow is 20 mm from the base", "place": [0.0, 0.5, 1.0],
         }],
         "applied": {"device": 1, "sequence": 4, "captured_micros": null, "applied_micros": null},

@@ -47,6 +47,7 @@ pub(crate) fn state() -> SteeringState {
         stop_number: None,
         is_recovering: false,
         is_moving: false,
+        moved_part: None,
         position: vec![0.0; N_JOINTS],
         target: None,
         base_from_tip: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],

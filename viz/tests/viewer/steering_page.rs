@@ -19,8 +19,8 @@ use trainer::{Projection, RenderRequest};
 use viz::{
     AppliedLimit, ArmDescription, Certificate, Hub, LimitEffect, LimitLink, Preview, PreviewGoal,
     PreviewVerdict, RefusedRequest, SceneHint, Server, ServerConfig, Sharing, Status, SteeredJoint,
-    SteeringCommand, SteeringIntent, SteeringRequest, SteeringServer, SteeringState, Tokens,
-    publish_steering,
+    SteeredPart, SteeringCommand, SteeringIntent, SteeringRequest, SteeringServer, SteeringState,
+    Tokens, publish_steering,
 };
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
@@ -186,6 +186,7 @@ fn state(script: &Script) -> SteeringState {
         stop_number: script.stop.as_ref().map(|_| script.stops.len() as u64),
         is_recovering: false,
         is_moving: false,
+        moved_part: None,
         position: POSITION.to_vec(),
         target: None,
         base_from_tip: transform::to_xyz_xyzw(&base_from_tip()),
@@ -537,6 +538,7 @@ fn check_refusal(page: &mut Page, arm: &ScriptedArm, view: &RenderRequest) {
     const TOLERANCE_PX: f64 = 3.0;
     arm.change(|script| {
         script.limits = vec![AppliedLimit {
+            part: SteeredPart::Arm,
             link: LimitLink::Clearance,
             effect: LimitEffect::Refused,
             speed_scale: 0.0,

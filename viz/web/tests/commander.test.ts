@@ -5,14 +5,14 @@ import { Commander } from "../src/steering/commander";
 import { NO_DEFLECTION } from "../src/steering/jog";
 import type { SteerMessage, SteerRequest, SteerState } from "../src/steering/messages";
 import { poseOf } from "../src/steering/pose";
-import { ARM, BASE, CLIENT, STATE } from "./steering_examples";
+import { ARM, BASE, BOTH, CLIENT, STATE } from "./steering_examples";
 import { assertClose, fakeClock } from "./close";
 
 type Command = SteerRequest & { type: "command" };
 
 const FORWARD = { kind: "tip", deflection: { ...NO_DEFLECTION, forward: 1 } } as const;
 const DEVICE = 42;
-const PAD = { isHeld: false, isGo: false, isStop: false, deflection: { ...NO_DEFLECTION, up: 1 } };
+const PAD = { isHeld: false, isGo: false, isStop: false, isSwitch: false, deflection: { ...NO_DEFLECTION, up: 1 } };
 
 /** A commander whose server answers after a fixed time, and everything that was sent and said. */
 class Bench {
@@ -288,7 +288,7 @@ test("over a slow link, inputs move a goal, and only go moves the arm", () => {
 
 test("a trigger and the button go move the arm to the goal, sticks discard the goal", () => {
   bench.run(1500);
-  const held = { isHeld: true, isGo: false, isStop: false, deflection: NO_DEFLECTION };
+  const held = { isHeld: true, isGo: false, isStop: false, isSwitch: false, deflection: NO_DEFLECTION };
   const preview = (): void => {
     bench.commander.preview([0.15, 0.2]);
     bench.run(120);
@@ -351,7 +351,7 @@ test("a link that becomes slow ends a grip in servo mode", () => {
 test("what was pressed in preview mode does not move the arm when the link becomes fast", () => {
   bench.roundTripMillis = 150;
   bench.run(2000);
-  const held = { isHeld: true, isGo: false, isStop: false, deflection: NO_DEFLECTION };
+  const held = { isHeld: true, isGo: false, isStop: false, isSwitch: false, deflection: NO_DEFLECTION };
   bench.commander.setPad(held);
   bench.commander.setPad({ ...held, isHeld: false });
   bench.roundTripMillis = 10;
@@ -408,7 +408,7 @@ test("everybody needs the stop button while somebody has control or the arm move
   assert.equal(bench.commander.canMove, true);
 });
 
-const BASE_STATE = { world_from_base: [0, 0, 0.5], goal: null, has_arrived: false } satisfies SteerState["base"];
+const BASE_STATE = { world_from_base: [0, 0, 0.5], goal: null, has_arrived: false, is_moving: false } satisfies SteerState["base"];
 
 /** A bench whose server steers a base. */
 function withBase(): Partial<SteerState> {
@@ -432,6 +432,45 @@ test("a base is driven with the same switch, in its own frame, also over a slow 
   bench.commander.setJog("keys", null);
   assert.equal(bench.last().grip, null);
   assert.equal(bench.commander.gizmo, null, "there is no hand");
+});
+
+test("all inputs move the chosen one of arm and base, and a choice lets go of the other", () => {
+  bench.commander.receive(BOTH, bench.clock.millis);
+  const state = { base: BASE_STATE };
+  bench.run(1500, state);
+  const { commander } = bench;
+  assert.equal(commander.part, "arm");
+  commander.setJog("keys", FORWARD);
+  bench.run(60, state);
+  assert.equal(bench.last().intent?.kind, "tip_velocity");
+  commander.choosePart("base");
+  assert.equal(bench.last().grip, null, "the grip moved the arm");
+  bench.run(60, state);
+  assert.equal(bench.last().grip, null, "the key is still down, but was pressed for the arm");
+  commander.setJog("keys", null);
+  commander.setJog("keys", FORWARD);
+  bench.run(60, state);
+  assert.deepEqual(bench.last().intent, { kind: "base_velocity", forward_m_s: 0.5 * 0.3, left_m_s: 0, yaw_rad_s: 0 });
+  assert.equal(commander.gizmo, null, "the hand cannot be dragged meanwhile");
+  commander.setJog("keys", null);
+  // The upper button of a gamepad switches, but not while a trigger is held.
+  commander.setPad({ ...PAD, isSwitch: true });
+  assert.equal(commander.part, "arm");
+  commander.setPad({ ...PAD, isSwitch: true });
+  assert.equal(commander.part, "arm", "it is still down");
+  commander.setPad(PAD);
+  commander.setPad({ ...PAD, isHeld: true, isSwitch: true });
+  assert.equal(commander.part, "arm");
+});
+
+test("stowing makes the stowed posture the goal of the arm", () => {
+  bench.commander.receive(BOTH, bench.clock.millis);
+  bench.run(1500, { base: BASE_STATE });
+  bench.commander.choosePart("base");
+  bench.commander.stow();
+  assert.equal(bench.commander.part, "arm");
+  const { target } = bench.commander.goal;
+  assert.deepEqual(target?.kind === "joints" && target.position, [0, 0.1]);
 });
 
 test("a base goes to its goal while go is held, and the goal is done after the release there", () => {

@@ -115,14 +115,14 @@ test("texts say who has control, and how the arm moves and why", () => {
   assert.equal(leaseText(other, CLIENT), "Operator 3 has control for at least 4 s more. Control is offered to you");
   assert.match(modeText("servo", 32.4, 120, false), /^Servo.*32 ms, limit 120 ms/);
   assert.match(modeText("preview", null, 120, true), /^Preview, then go as chosen.*not measured/);
-  const limit = { link: "clearance", speed_scale: 0.25, text: "3 cm to a surface", place: null };
+  const limit = { part: "arm", link: "clearance", speed_scale: 0.25, text: "3 cm to a surface", place: null };
   assert.equal(limitText({ ...limit, effect: "slowed" }), "Slowed to 25 %: 3 cm to a surface");
   assert.equal(limitText({ ...limit, effect: "refused" }), "Refused: 3 cm to a surface");
   assert.equal(verdictText("unreachable", ""), "The goal is out of reach");
 });
 
 test("an open switch at rest is no news", () => {
-  const clutch = { link: "clutch", effect: "braked", speed_scale: 0, text: "the dead-man switch is open", place: null } as const;
+  const clutch = { part: "arm", link: "clutch", effect: "braked", speed_scale: 0, text: "the dead-man switch is open", place: null } as const;
   const clearance = { ...clutch, link: "clearance", effect: "slowed" } as const;
   assert.deepEqual(shownLimits([clutch, clearance], false), [clearance]);
   assert.deepEqual(shownLimits([clutch, clearance], true), [clutch, clearance]);

@@ -23,7 +23,7 @@ test("a base needs no joints, and damaged parts of it are left out", () => {
   assert.deepEqual(parsed(BASE), BASE);
   assert.equal(parsed({ ...BASE, base: { ...BASE.base, max_yaw_rad_s: "fast" } }), null);
   assert.deepEqual(parsed({ ...BASE, base: { ...BASE.base, area_m: [0, 1] } }), { ...BASE, base: { ...BASE.base, area_m: null } });
-  const base = { world_from_base: [1, 2, 3], goal: [4, 5, 6], has_arrived: true };
+  const base = { world_from_base: [1, 2, 3], goal: [4, 5, 6], has_arrived: true, is_moving: false };
   assert.deepEqual(parsed({ ...STATE, position: [], base }), { ...STATE, position: [], base });
   const damaged = parsed({ ...STATE, base: { ...base, goal: [4, null, 6], has_arrived: 1 } }) as typeof STATE;
   assert.deepEqual(damaged.base, { ...base, goal: null, has_arrived: false });
@@ -48,7 +48,7 @@ test("damaged messages are left out as a whole, and damaged limits one by one", 
     JSON.stringify({ type: "preview", id: 1, verdict: "perhaps", text: "" }),
   ];
   for (const text of damaged) assert.equal(parseMessage(text), null, text);
-  const limit = { link: "clearance", effect: "slowed", speed_scale: 0.5, text: "table", place: [0, 1, 2] };
+  const limit = { part: "base", link: "clearance", effect: "slowed", speed_scale: 0.5, text: "table", place: [0, 1, 2] };
   const state = parsed({ ...STATE, limits: [limit, { ...limit, effect: "danced" }, null, { ...limit, place: [0, 1] }] });
   assert.deepEqual((state as typeof STATE).limits, [limit, { ...limit, place: null }]);
 });

@@ -24,7 +24,13 @@ export const ARM: Arm = {
 export const BASE: Arm = {
   ...ARM,
   joints: [],
-  base: { max_forward_m_s: 0.5, max_left_m_s: 0, max_yaw_rad_s: 1, area_m: [-1, -1, 1, 1] },
+  base: { max_forward_m_s: 0.5, max_left_m_s: 0, max_yaw_rad_s: 1, area_m: [-1, -1, 1, 1], avoidance: "unknown_space", stowed: null },
+};
+
+/** The arm of [`ARM`] on a base that can move sideways. */
+export const BOTH: Arm = {
+  ...ARM,
+  base: { max_forward_m_s: 0.5, max_left_m_s: 0.3, max_yaw_rad_s: 1, area_m: null, avoidance: "seen_surfaces", stowed: [0, 0.1] },
 };
 
 /** This client has control, and the arm is at rest. */
@@ -38,6 +44,7 @@ export const STATE: SteerState = {
   stop_number: null,
   is_recovering: false,
   is_moving: false,
+  moved_part: null,
   position: [0.1, 0.2],
   target: null,
   base_from_tip: [0.5, 0, 0.4, 0, 0, 0, 1],

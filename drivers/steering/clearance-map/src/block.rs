@@ -171,6 +171,11 @@ impl Block {
         !self.free[z].to_le_bytes()[y]
     }
 
+    /// The bits of the row of voxels at (y, z) in which a surface was seen.
+    pub(crate) fn occupied_row(&self, y: usize, z: usize) -> u8 {
+        self.occupied[z].to_le_bytes()[y]
+    }
+
     /// Time of the oldest free voxel of a cell, or [`NEVER`].
     pub(crate) fn oldest_free(&self, [cell_x, cell_y, cell_z]: [usize; 3]) -> u32 {
         let mut oldest = NEVER;

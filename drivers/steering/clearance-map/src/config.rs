@@ -41,6 +41,9 @@ pub struct MapConfig {
     /// Depth of the space behind a surface that has just appeared whose earlier state is forgotten,
     /// meters. What has appeared is solid, up to this thickness.
     pub hidden_depth_m: f64,
+    /// Whether distances from surfaces alone are asked for, beside those from all that is not known
+    /// to be free.
+    pub has_surfaces: bool,
 }
 
 impl MapConfig {
@@ -56,7 +59,16 @@ impl MapConfig {
             max_depth_m: 4.0,
             robot_margin_m: 0.03,
             hidden_depth_m: 0.15,
+            has_surfaces: false,
         }
+    }
+
+    /// The largest reach of these settings, meters.
+    #[must_use]
+    pub fn max_reach_m() -> f64 {
+        let config = Self::for_reach(0.0);
+        let n_blocks = (MAX_BLOCKS - 1) / 2 - config.border_blocks();
+        n_blocks as f64 * BLOCK_VOXELS as f64 * config.voxel_m - config.max_distance_m
     }
 
     /// Blocks per side, with a border on each side that is never seen, so that searches near the

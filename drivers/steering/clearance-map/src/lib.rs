@@ -1,4 +1,4 @@
-//! A map of free space around an arm, made from depth images on the CPU.
+//! A map of free space around a robot, made from depth images on the CPU.
 //!
 //! [`ClearanceMap`] answers how far points of an arm are from everything that is not known to be
 //! free, and how long ago this was seen. It needs neither the GPU nor a trainer: its own thread
@@ -30,6 +30,14 @@
 //! margin: in a region that was never seen, parts can neither enter new space nor widen the space
 //! in which they are, but they can leave it.
 //!
+//! # Bases
+//!
+//! A base that moves ([`MapBase`]) asks for the points of its footprint with
+//! [`steering::Clearance::base_readings`]. The whole footprint where the base is now is free for
+//! these answers, not only the parts of the robot in it. A base that may enter space that was never
+//! seen gets distances from surfaces alone. Scans of range scanners become depth images with
+//! [`images_of_scan`].
+//!
 //! # Limits
 //!
 //! - Readings without a neighbor of a similar depth are noise, so a surface must cover at least two
@@ -53,6 +61,7 @@ mod map;
 mod query;
 mod rows;
 mod samples;
+mod scan;
 mod snapshot;
 mod surfaces;
 #[cfg(test)]
@@ -63,4 +72,5 @@ mod voxel_map;
 pub use config::{MapConfig, reach_m};
 pub use error::Error;
 pub use image::{DepthImage, DepthOrigin, Posture};
-pub use map::{ClearanceMap, MapState};
+pub use map::{ClearanceMap, MapBase, MapState};
+pub use scan::images_of_scan;

@@ -4,14 +4,15 @@ use crate::config::MapConfig;
 use crate::error::Error;
 use crate::image::{DepthImage, Posture};
 use crate::query::{Query, Robot};
+use crate::rows::Obstacles;
 use crate::snapshot::Snapshot;
 use crate::voxel_map::VoxelMap;
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
 use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use steering::{Body, Clearance, Seen};
+use steering::{Body, Capsule, Clearance, Footprint, Seen};
 
 /// Maximum number of cameras whose newest image waits. Images of more cameras replace the oldest.
 const MAX_WAITING: usize = 16;
@@ -28,7 +29,21 @@ const ENDED: &str = "the thread of the map of free space has ended, which is a b
 pub struct ClearanceMap {
     shared: Arc<Shared>,
     query: Mutex<Query>,
+    /// For the footprint of the base, if there is one.
+    base_query: Option<Mutex<Query>>,
     thread: Option<JoinHandle<()>>,
+}
+
+/// A base that moves in the map.
+#[derive(Clone, Debug)]
+pub struct MapBase {
+    /// The space that the base occupies.
+    pub footprint: Footprint,
+    /// Whether the base may enter space that was never seen.
+    pub is_unseen_free: bool,
+    /// Distance around the footprint up to which space is free where the base was, for
+    /// [`ClearanceMap::sweep`]; 0 to 0.2 m.
+    pub swept_margin_m: f64,
 }
 
 /// Counts since the start.
@@ -50,9 +65,28 @@ pub struct MapState {
 #[derive(Debug)]
 struct Shared {
     body: Body,
+    footprint: MapFootprint,
     inbox: Mutex<Inbox>,
     arrived: Condvar,
     published: Mutex<Published>,
+}
+
+/// The footprint of a base in the map; empty without a base.
+#[derive(Debug, Default)]
+struct MapFootprint {
+    capsules: Vec<Capsule>,
+    heights_m: Option<[f64; 2]>,
+    swept_margin_m: f64,
+}
+
+impl MapFootprint {
+    fn of(base: &MapBase) -> Self {
+        Self {
+            capsules: base.footprint.capsules(),
+            heights_m: Some(base.footprint.height_m()),
+            swept_margin_m: base.swept_margin_m,
+        }
+    }
 }
 
 #[derive(Debug, Default)]
@@ -85,11 +119,37 @@ impl ClearanceMap {
     /// # Errors
     /// If a setting is out of its range, or the thread cannot be started.
     pub fn start(config: &MapConfig, body: Body) -> Result<Self, Error> {
+        Self::start_with(config, body, None)
+    }
+
+    /// Starts the thread of a map in which a base moves, too.
+    ///
+    /// # Errors
+    /// As [`ClearanceMap::start`].
+    pub fn start_with_base(config: &MapConfig, body: Body, base: &MapBase) -> Result<Self, Error> {
+        check_margin(base.swept_margin_m)?;
+        let config = MapConfig {
+            has_surfaces: base.is_unseen_free,
+            ..config.clone()
+        };
+        Self::start_with(&config, body, Some(base))
+    }
+
+    fn start_with(config: &MapConfig, body: Body, base: Option<&MapBase>) -> Result<Self, Error> {
         let map = VoxelMap::new(config)?;
         let snapshot = Arc::new(map.snapshot());
-        let query = Query::new(config, Arc::clone(&snapshot));
+        let query = Query::new(config, Arc::clone(&snapshot), Obstacles::NotFree);
+        let base_query = base.map(|base| {
+            let obstacles = if base.is_unseen_free {
+                Obstacles::Surfaces
+            } else {
+                Obstacles::NotFree
+            };
+            Mutex::new(Query::new(config, Arc::clone(&snapshot), obstacles))
+        });
         let shared = Arc::new(Shared {
             body,
+            footprint: base.map_or_else(MapFootprint::default, MapFootprint::of),
             inbox: Mutex::default(),
             arrived: Condvar::new(),
             published: Mutex::new(Published {
@@ -104,6 +164,7 @@ impl ClearanceMap {
         Ok(Self {
             shared,
             query: Mutex::new(query),
+            base_query,
             thread: Some(thread),
         })
     }
@@ -133,7 +194,7 @@ impl ClearanceMap {
     }
 
     /// Marks the space that the robot occupies at a posture, and `margin_m` around it, as free
-    /// where nothing was ever seen. Space in which cameras saw surfaces does not change.
+    /// where nothing was ever seen, and the footprint of its base with the margin of [`MapBase`]. Space in which cameras saw surfaces does not change.
     ///
     /// For motions that are known to be safe, such as a scan before steering: an arm whose links
     /// are never in view could not be steered otherwise. Never call it while an operator steers,
@@ -143,13 +204,7 @@ impl ClearanceMap {
     /// If the posture is invalid, or the margin is not between 0 and 0.2 m.
     pub fn sweep(&self, posture: Posture, margin_m: f64) -> Result<(), Error> {
         posture.check(self.shared.body.n_joints())?;
-        if !(0.0..=0.2).contains(&margin_m) {
-            return Err(Error::Value {
-                what: "the margin of swept space",
-                value: margin_m,
-                expected: "from 0 to 0.2",
-            });
-        }
+        check_margin(margin_m)?;
         let mut inbox = self.shared.inbox.lock();
         if inbox.swept.len() == MAX_WAITING {
             inbox.swept.pop_front();
@@ -172,9 +227,37 @@ impl ClearanceMap {
             stamp: posture.stamp,
             capsules: self.shared.body.capsules(&posture.position),
             world_from_base: posture.world_from_base,
+            heights_m: None,
         };
         self.query.lock().set_robot(robot);
+        self.set_base(posture.stamp, posture.world_from_base);
         Ok(())
+    }
+
+    /// Sets where the base is now, in whose footprint everything is free for the base itself. A
+    /// posture also sets it.
+    pub fn set_base(&self, stamp: Stamp, world_from_base: Transform) {
+        if let Some(query) = &self.base_query {
+            query.lock().set_robot(Robot {
+                stamp,
+                capsules: self.shared.footprint.capsules.clone(),
+                world_from_base,
+                heights_m: self.shared.footprint.heights_m,
+            });
+        }
+    }
+
+    /// What is known about points, from the newest complete version of the map.
+    fn answer(&self, query: &Mutex<Query>, points: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        // The newest map would look as if only its ages grew, while the scene may change.
+        if self.has_ended() {
+            return Vec::new();
+        }
+        // The lock of the published map is held only while a pointer is copied.
+        let snapshot = Arc::clone(&self.shared.published.lock().snapshot);
+        let mut query = query.lock();
+        query.set_snapshot(snapshot);
+        query.readings(points, now)
     }
 
     /// Forgets everything, for example after a correction has moved the frame of the poses.
@@ -204,20 +287,30 @@ impl ClearanceMap {
 
 impl Clearance for ClearanceMap {
     fn readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
-        // The newest map would look as if only its ages grew, while the scene may change.
-        if self.has_ended() {
-            return Vec::new();
+        self.answer(&self.query, points_in_base, now)
+    }
+
+    fn base_readings(&self, points_in_base: &[[f64; 3]], now: Stamp) -> Vec<Option<Seen>> {
+        match &self.base_query {
+            Some(query) => self.answer(query, points_in_base, now),
+            None => Vec::new(),
         }
-        // The lock of the published map is held only while a pointer is copied.
-        let snapshot = Arc::clone(&self.shared.published.lock().snapshot);
-        let mut query = self.query.lock();
-        query.set_snapshot(snapshot);
-        query.readings(points_in_base, now)
     }
 
     fn failure(&self) -> Option<String> {
         self.has_ended().then(|| ENDED.to_owned())
     }
+}
+
+fn check_margin(margin_m: f64) -> Result<(), Error> {
+    if (0.0..=0.2).contains(&margin_m) {
+        return Ok(());
+    }
+    Err(Error::Value {
+        what: "the margin of swept space",
+        value: margin_m,
+        expected: "from 0 to 0.2",
+    })
 }
 
 impl Drop for ClearanceMap {
@@ -242,6 +335,8 @@ impl Shared {
                 Job::Sweep(posture, margin_m) => {
                     let capsules = self.body.capsules(&posture.position);
                     map.sweep(&capsules, &posture, margin_m);
+                    let footprint = &self.footprint;
+                    map.sweep(&footprint.capsules, &posture, footprint.swept_margin_m);
                 }
                 Job::Integrate(image) => {
                     let capsules = self.body.capsules(&image.posture.position);

@@ -3,8 +3,8 @@
 use crate::block::{BLOCK_CELLS, CELL_VOXELS, NEVER};
 use crate::capsules::{GridCapsule, in_grid};
 use crate::config::{BLOCK_VOXELS, MapConfig};
-use crate::grid::floor;
-use crate::rows::{BUNDLE, Rows};
+use crate::grid::{Grid, floor};
+use crate::rows::{BUNDLE, Obstacles, Rows};
 use crate::snapshot::Snapshot;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
@@ -21,6 +21,8 @@ pub(crate) struct Robot {
     pub(crate) stamp: Stamp,
     pub(crate) capsules: Vec<Capsule>,
     pub(crate) world_from_base: Transform,
+    /// Lowest and highest height of obstacles in the frame of the base, meters; `None` for all.
+    pub(crate) heights_m: Option<[f64; 2]>,
 }
 
 /// A version of the map without the robot, and the tables for searches.
@@ -58,11 +60,11 @@ struct Around {
 }
 
 impl Query {
-    pub(crate) fn new(config: &MapConfig, snapshot: Arc<Snapshot>) -> Self {
+    pub(crate) fn new(config: &MapConfig, snapshot: Arc<Snapshot>, obstacles: Obstacles) -> Self {
         #[expect(clippy::cast_possible_truncation, reason = "inner loops use f32")]
         let max_distance = (config.max_distance_m / config.voxel_m) as f32;
         Self {
-            rows: Rows::new(&snapshot),
+            rows: Rows::new(&snapshot, obstacles),
             snapshot,
             robot: None,
             in_grid: Vec::new(),
@@ -264,12 +266,31 @@ impl Query {
     /// Computes where the robot is in the grid. If it has moved, its volume must be cleared anew.
     fn place_robot(&mut self) {
         let grid = &self.snapshot.grid;
+        if let Some(layers) = self.robot.as_ref().and_then(|robot| robot.layers(grid))
+            && self.rows.set_layers(layers)
+        {
+            self.rows.set_map(&self.snapshot);
+            self.cleared.clear();
+        }
         if let Some(robot) = &self.robot {
             self.in_grid = in_grid(&robot.capsules, &robot.world_from_base, grid, 0.0);
         }
         let moved = |(now, then): (&GridCapsule, &GridCapsule)| now.moved(then) > MAX_MOTION;
         self.is_outdated |= self.in_grid.len() != self.cleared.len()
             || self.in_grid.iter().zip(&self.cleared).any(moved);
+    }
+}
+
+impl Robot {
+    /// The layers of voxels in which obstacles are. A base that walks moves up and down by
+    /// millimeters, so the layers are those closest to its heights.
+    fn layers(&self, grid: &Grid) -> Option<[usize; 2]> {
+        let base = self.world_from_base.translation.vector;
+        let layer = |height_m: f64| {
+            let up = Vector3::new(0.0, 0.0, height_m);
+            floor((grid.in_voxels(&(base + up)).z.max(0.0) + 0.5) as f32)
+        };
+        Some(self.heights_m?.map(layer))
     }
 }
 

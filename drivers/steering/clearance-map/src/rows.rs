@@ -7,9 +7,23 @@ use crate::snapshot::Snapshot;
 /// Rows of voxels per side of a bundle, which is skipped as a whole if all of its voxels are free.
 pub(crate) const BUNDLE: usize = 4;
 
-/// Rows and bundles of rows, one bit per voxel that is not free. See [`Grid::row`].
+/// The voxels from which distances are measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Obstacles {
+    /// All that are not known to be free.
+    NotFree,
+    /// Those in which a surface was seen.
+    Surfaces,
+}
+
+/// Rows and bundles of rows, one bit per voxel from which distances are measured. See
+/// [`Grid::row`].
 #[derive(Debug)]
 pub(crate) struct Rows {
+    obstacles: Obstacles,
+    /// First layer of voxels, and the layer after the last one, outside of which nothing is an
+    /// obstacle.
+    layers: [usize; 2],
     grid: Grid,
     blocked: Vec<u8>,
     /// For each bundle of rows, the union of its rows.
@@ -24,8 +38,10 @@ pub(crate) struct Rows {
 
 impl Rows {
     /// The rows of a version of the map.
-    pub(crate) fn new(snapshot: &Snapshot) -> Self {
+    pub(crate) fn new(snapshot: &Snapshot, obstacles: Obstacles) -> Self {
         let mut rows = Self {
+            obstacles,
+            layers: [0, usize::MAX],
             grid: snapshot.grid,
             blocked: Vec::new(),
             bundles: Vec::new(),
@@ -40,12 +56,29 @@ impl Rows {
     /// Takes another version of the map, without a robot.
     pub(crate) fn set_map(&mut self, snapshot: &Snapshot) {
         self.grid = snapshot.grid;
-        self.blocked.clone_from(&snapshot.blocked);
+        self.blocked
+            .clone_from(match (&snapshot.occupied, self.obstacles) {
+                (Some(occupied), Obstacles::Surfaces) => occupied,
+                _ => &snapshot.blocked,
+            });
+        let layer_bytes = self.grid.side() * self.grid.row_bytes();
+        let n_bytes = self.blocked.len();
+        let [first, end] = self
+            .layers
+            .map(|layer| layer.saturating_mul(layer_bytes).min(n_bytes));
+        self.blocked[..first].fill(0);
+        self.blocked[end..].fill(0);
         self.join_rows();
         self.changed.clear();
         self.changed_bundles.clear();
         self.is_bundle_changed.clear();
         self.is_bundle_changed.resize(self.bundles.len(), false);
+    }
+
+    /// Lets only some layers of voxels be obstacles, from the next version of the map on. Returns
+    /// whether they have changed.
+    pub(crate) fn set_layers(&mut self, layers: [usize; 2]) -> bool {
+        std::mem::replace(&mut self.layers, layers) != layers
     }
 
     /// Clears the voxels inside of the robot, instead of those of the robot before.

@@ -13,19 +13,25 @@ pub(crate) struct Snapshot {
     pub(crate) clock: MapClock,
     /// Rows of voxels along x, one bit each, set if the voxel is not free. See [`Grid::row`].
     pub(crate) blocked: Vec<u8>,
+    /// The same for voxels in which a surface was seen; `None` if nothing asks for it.
+    pub(crate) occupied: Option<Vec<u8>>,
     /// Time of the oldest free voxel of each cell, or [`NEVER`]. Order: z, y, x.
     pub(crate) oldest: Vec<u32>,
 }
 
 impl Snapshot {
     /// A map in which nothing was ever seen.
-    pub(crate) fn unknown(grid: Grid) -> Self {
+    ///
+    /// * `has_surfaces`: whether surfaces are asked for.
+    pub(crate) fn unknown(grid: Grid, has_surfaces: bool) -> Self {
         let side = grid.side();
+        let n_bytes = side * side * grid.row_bytes();
         let n_cells = grid.n_blocks * BLOCK_CELLS;
         Self {
             grid,
             clock: MapClock::default(),
-            blocked: vec![u8::MAX; side * side * grid.row_bytes()],
+            blocked: vec![u8::MAX; n_bytes],
+            occupied: has_surfaces.then(|| vec![0; n_bytes]),
             oldest: vec![NEVER; n_cells * n_cells * n_cells],
         }
     }
@@ -42,6 +48,9 @@ impl Snapshot {
                 for dy in 0..BLOCK_VOXELS {
                     let row = self.grid.row(y * BLOCK_VOXELS + dy, z * BLOCK_VOXELS + dz);
                     self.blocked[row + x] = block.blocked_row(dy, dz);
+                    if let Some(occupied) = &mut self.occupied {
+                        occupied[row + x] = block.occupied_row(dy, dz);
+                    }
                 }
             }
             for cell_ix in 0..BLOCK_CELLS * BLOCK_CELLS * BLOCK_CELLS {

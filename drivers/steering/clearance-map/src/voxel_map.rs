@@ -45,7 +45,7 @@ impl VoxelMap {
         Ok(Self {
             config: config.clone(),
             clock: MapClock::default(),
-            snapshot: Snapshot::unknown(blocks.grid),
+            snapshot: Snapshot::unknown(blocks.grid, config.has_surfaces),
             blocks,
             robot: RobotMask::default(),
             pyramid: Pyramid::default(),
@@ -95,7 +95,7 @@ impl VoxelMap {
         is_visible
     }
 
-    /// Marks space in and near the robot as free where nothing was ever seen.
+    /// Marks space in and near capsules of the robot as free where nothing was ever seen.
     pub(crate) fn sweep(&mut self, capsules_in_base: &[Capsule], posture: &Posture, margin_m: f64) {
         self.clock.start(posture.stamp);
         let Some(millis) = self.clock.millis(posture.stamp) else {
@@ -117,7 +117,7 @@ impl VoxelMap {
     /// Forgets everything.
     pub(crate) fn clear(&mut self) {
         self.blocks.clear();
-        self.snapshot = Snapshot::unknown(self.blocks.grid);
+        self.snapshot = Snapshot::unknown(self.blocks.grid, self.config.has_surfaces);
     }
 
     /// The newest version for answers.
@@ -164,7 +164,7 @@ impl VoxelMap {
         }
         let moved = Grid::around(&self.config, &base);
         self.blocks.move_to(moved);
-        self.snapshot = Snapshot::unknown(moved);
+        self.snapshot = Snapshot::unknown(moved, self.config.has_surfaces);
     }
 
     fn publish(&mut self) {

@@ -2,8 +2,9 @@
 //! the arm on it.
 
 use crate::{
-    BaseEntry, BaseSetup, BaseSituation, BaseSteering, BaseSteeringConfig, BaseVerdict, Command,
-    Device, FloorPose, Intent, Operator, Reason, Request, SeenPose, SeenPosture, Stowed,
+    AnalyticScene, BaseSituation, BaseSteeringConfig, BaseVerdict, Clearance, Command, Device,
+    Entry, FloorPose, Intent, Operator, Reason, Request, SeenPose, SeenPosture, Setup, Situation,
+    Steering, Stowed,
 };
 use drivers::base_motion::{BaseFollower, BaseLimits, BaseOutput, BaseState, BaseVelocity};
 use kinematics::Stamp;
@@ -30,7 +31,8 @@ const ROUNDING: f64 = 1e-9;
 
 /// A chain and a base that has the velocities of its follower, and whose pose is reported late.
 struct Sim {
-    steering: BaseSteering,
+    steering: Steering,
+    scene: Box<dyn Clearance>,
     follower: BaseFollower,
     pose: FloorPose,
     poses: VecDeque<SeenPose>,
@@ -46,7 +48,12 @@ impl Sim {
     fn new(config: BaseSteeringConfig) -> Self {
         Self {
             follower: BaseFollower::new(config.limits).unwrap(),
-            steering: BaseSteering::new(config).unwrap(),
+            steering: Steering::of_base(config).unwrap(),
+            scene: Box::new(AnalyticScene {
+                solids: Vec::new(),
+                seen_at: Stamp(0),
+                seen_radius_m: 10.0,
+            }),
             pose: FloorPose {
                 x_m: 0.0,
                 y_m: 0.0,
@@ -114,7 +121,14 @@ impl Sim {
                 position,
             }),
         };
-        let verdict = self.steering.cycle(self.now, &situation);
+        let situation = Situation {
+            arm: None,
+            base: Some(situation),
+        };
+        let decision = self
+            .steering
+            .decide(self.now, &situation, self.scene.as_ref());
+        let verdict = decision.base.unwrap();
         match &verdict.output {
             BaseOutput::Drive(target) => self.follower.follow(self.now, target).unwrap(),
             BaseOutput::Brake => self
@@ -128,7 +142,7 @@ impl Sim {
     /// Number of the newest motion.
     fn n(&self) -> u64 {
         let entries = serde_json::to_value(self.steering.state()).unwrap();
-        entries["n_motions"].as_u64().unwrap()
+        entries["base"]["n_motions"].as_u64().unwrap()
     }
 
     /// One cycle of the base alone, as if the chain was stuck.
@@ -418,8 +432,8 @@ fn random_events_break_no_limit_and_replay_bit_for_bit() {
         area_m: Some([-1.0, -1.0, 1.0, 1.0]),
         ..config()
     });
-    let setup: BaseSetup =
-        serde_json::from_str(&serde_json::to_string(&sim.steering.setup()).unwrap()).unwrap();
+    let setup = serde_json::to_string(&sim.steering.setup(String::new())).unwrap();
+    let setup: Setup = serde_json::from_str(&setup).unwrap();
     sim.steering.take_record();
     let mut entries = Vec::new();
     let mut grip = 1;
@@ -466,20 +480,20 @@ fn random_events_break_no_limit_and_replay_bit_for_bit() {
     let mut replayed = setup.build().unwrap();
     for entry in &entries {
         let line = serde_json::to_string(entry).unwrap();
-        let entry: BaseEntry = serde_json::from_str(&line).unwrap();
+        let entry: Entry = serde_json::from_str(&line).unwrap();
         replayed.replay(&entry).unwrap();
     }
     assert_eq!(replayed.state(), sim.steering.state());
     // A target that differs in its last bit is found.
     let mut fresh = setup.build().unwrap();
     let changed = entries.iter_mut().find_map(|entry| match entry {
-        BaseEntry::Cycle { verdict, .. } => match &mut verdict.output {
+        Entry::Cycle { base, .. } => match &mut base.as_mut()?.verdict.output {
             BaseOutput::Drive(target) if target.velocity.forward_m_s != 0.0 => {
                 Some(&mut target.velocity.forward_m_s)
             }
             _ => None,
         },
-        BaseEntry::Request { .. } => None,
+        Entry::Request { .. } => None,
     });
     let changed = changed.expect("a velocity");
     *changed = f64::from_bits(changed.to_bits() ^ 1);
@@ -513,7 +527,7 @@ fn configurations_that_cannot_work_are_refused() {
             "stowed",
         ),
     ] {
-        let error = BaseSteering::new(config).unwrap_err().to_string();
+        let error = Steering::of_base(config).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
 }

@@ -60,9 +60,7 @@ fn record_survives_json_and_replays_bit_for_bit() {
         let entry: Entry = serde_json::from_str(line).unwrap();
         assert_eq!(serde_json::to_string(&entry).unwrap(), *line);
         steering.replay(&entry).unwrap();
-        if let Entry::Cycle { verdict, .. } = entry {
-            n_follows += u32::from(verdict.target().is_some());
-        }
+        n_follows += u32::from(entry.has_target());
     }
     assert!(n_follows > 200, "{n_follows}");
     assert!(lines.iter().any(|line| line.contains("NaN")));
@@ -73,7 +71,7 @@ fn record_survives_json_and_replays_bit_for_bit() {
 fn changed_record_is_detected() {
     let (config, mut entries) = session();
     let changed = entries.iter_mut().rev().find_map(|entry| match entry {
-        Entry::Cycle { verdict, .. } => match &mut verdict.output {
+        Entry::Cycle { arm, .. } => match &mut arm.as_mut()?.verdict.output {
             crate::Output::Follow(target) => Some(&mut target.position[3]),
             crate::Output::Brake => None,
         },
@@ -121,9 +119,7 @@ fn record_that_begins_in_the_middle_of_a_grip_replays_from_its_setup() {
     let mut n_follows = 0;
     for entry in &entries {
         steering.replay(entry).unwrap();
-        if let Entry::Cycle { verdict, .. } = entry {
-            n_follows += u32::from(verdict.target().is_some());
-        }
+        n_follows += u32::from(entry.has_target());
     }
     assert!(n_follows > 100, "{n_follows}");
     assert_eq!(steering.state(), sim.steering.state());
@@ -142,7 +138,7 @@ fn damaged_setup_and_record_are_refused() {
         (r#""max_speed_m_s":0.25"#, r#""max_speed_m_s":-1.0"#),
         (
             r#""motion":null"#,
-            r#""motion":{"target":[0.0],"accepted_m":1.0}"#,
+            r#""motion":{"grip":1,"target":[0.0],"accepted_m":1.0}"#,
         ),
         (
             r#""tip_link":"panda_link8""#,
@@ -157,11 +153,13 @@ fn damaged_setup_and_record_are_refused() {
     let mut steering = new_steering(config);
     let mut entry = entries
         .iter()
-        .find(|entry| matches!(entry, Entry::Cycle { seen, .. } if seen.concat().len() > 1))
+        .find(|entry| {
+            matches!(entry, Entry::Cycle { arm: Some(arm), .. } if arm.seen.concat().len() > 1)
+        })
         .cloned()
         .expect("near an obstacle");
-    if let Entry::Cycle { seen, .. } = &mut entry {
-        for restriction in seen.iter_mut().flatten() {
+    if let Entry::Cycle { arm: Some(arm), .. } = &mut entry {
+        for restriction in arm.seen.iter_mut().flatten() {
             restriction.point_ix = usize::MAX;
         }
     }

@@ -1,13 +1,14 @@
 //! The loop of a base with a thread that drives an ideal base. Nothing depends on the speed of the
 //! machine: the tests wait for conditions, and grip again if the base has braked meanwhile.
 
-use super::base_loop::{BaseLoop, BaseOutcome};
 use super::robot_watch::SeenRobot;
-use crate::steering::steering_log::{LoopLog, files_of, incidents, replay};
+use crate::steering::NoScene;
+use crate::steering::steering_log::{About, files_of, incidents, replay};
+use crate::steering::steering_loop::{Outcome, Reply, Reports, SteeringLoop};
 use crate::steering::time_base::TimeBase;
 use drivers::base_motion::{BaseDrive, BaseLimits, BaseReport, BaseVelocity, MovableBase};
 use drivers::clock;
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
 use parking_lot::Mutex;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -57,7 +58,7 @@ impl MovableBase for IdealBase {
 struct Test {
     base: IdealBase,
     drive: BaseDrive,
-    base_loop: BaseLoop,
+    base_loop: SteeringLoop,
     sequence: u64,
     grip: u64,
 }
@@ -70,7 +71,7 @@ impl Test {
             area_m: Some([-1.0, -1.0, 1.0, 1.0]),
             ..BaseSteeringConfig::new(LIMITS)
         };
-        let base_loop = BaseLoop::new(config, drive.port().clone(), TimeBase::now());
+        let base_loop = SteeringLoop::of_base(config, drive.port().clone(), TimeBase::now());
         Self {
             base,
             drive,
@@ -80,7 +81,7 @@ impl Test {
         }
     }
 
-    fn cycle(&mut self, requests: &[(u64, SteeringRequest)]) -> BaseOutcome {
+    fn cycle(&mut self, requests: &[(u64, SteeringRequest)]) -> Outcome {
         std::thread::sleep(Duration::from_millis(5));
         let now = clock::now();
         let received: Vec<ReceivedRequest> = requests
@@ -104,7 +105,11 @@ impl Test {
             }),
             posture: None,
         };
-        self.base_loop.cycle(now, &received, &seen)
+        let reports = Reports {
+            arm: None,
+            robot: seen,
+        };
+        self.base_loop.cycle(now, &received, &reports, &NoScene)
     }
 
     fn command(&mut self, grip: Option<u64>, intent: SteeringIntent) -> SteeringRequest {
@@ -136,14 +141,23 @@ impl Test {
                 vec![(ANA, closed)]
             };
             let outcome = self.cycle(&requests);
-            let base = outcome.state.base.clone().expect("a base is steered");
+            let state = outcome.state.expect("a base always has a state");
+            let base = state.base.clone().expect("a base is steered");
             was_braking = base.target.is_none();
             let velocity = *self.base.0.lock();
-            if is_reached(&outcome.state, velocity) {
-                return outcome.state;
+            if is_reached(&state, velocity) {
+                return state;
             }
-            assert!(began.elapsed() < TIMEOUT, "{:?}", outcome.state);
+            assert!(began.elapsed() < TIMEOUT, "{state:?}");
         }
+    }
+}
+
+/// The first refusal: client, kind and reason.
+fn refusal(outcome: &Outcome) -> (u64, RefusedRequest, &str) {
+    match &outcome.replies[..] {
+        [(client, Reply::Refused(kind, text)), ..] => (*client, *kind, text),
+        other => panic!("no refusal: {other:?}"),
     }
 }
 
@@ -159,10 +173,14 @@ fn forward(forward_m_s: f64) -> SteeringIntent {
 fn an_operator_drives_the_base_and_the_log_replays_and_shows_the_stop() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut test = Test::new();
-    let log = LoopLog::of_base(folder.path(), test.base_loop.steering());
-    test.base_loop.log_into(log.expect("a thread"));
+    let about = About {
+        urdf: String::new(),
+        world_from_base: Transform::identity(),
+    };
+    let result = test.base_loop.log_into(folder.path(), about);
+    result.expect("a thread");
     let outcome = test.cycle(&[(ANA, SteeringRequest::TakeLease)]);
-    assert!(outcome.ends_tour && outcome.refusals.is_empty());
+    assert!(outcome.begins && outcome.replies.is_empty());
     let state = test.hold_until(&forward(0.25), |_, velocity| velocity.forward_m_s == 0.25);
     assert_eq!(state.holder, Some(ANA));
     let base = state.base.expect("a base is steered");
@@ -182,7 +200,8 @@ fn an_operator_drives_the_base_and_the_log_replays_and_shows_the_stop() {
 
     let outcome = test.cycle(&[(BEN, SteeringRequest::Stop)]);
     assert!(outcome.ends_tour);
-    let stop = outcome.state.stop.expect("it is stopped");
+    let stop = outcome.state.and_then(|state| state.stop);
+    let stop = stop.expect("it is stopped");
     assert!(stop.contains("stopped by operator 2"), "{stop}");
     let began = Instant::now();
     while *test.base.0.lock() != BaseVelocity::ZERO {
@@ -191,8 +210,8 @@ fn an_operator_drives_the_base_and_the_log_replays_and_shows_the_stop() {
     }
     let command = test.command(Some(999), forward(0.25));
     let outcome = test.cycle(&[(ANA, command)]);
-    let (client, kind, text) = &outcome.refusals[0];
-    assert_eq!((*client, *kind), (ANA, RefusedRequest::Command));
+    let (client, kind, text) = refusal(&outcome);
+    assert_eq!((client, kind), (ANA, RefusedRequest::Command));
     assert!(text.contains("stopped by operator 2"), "{text}");
 
     test.base_loop.finish();
@@ -227,14 +246,14 @@ fn a_client_that_leaves_releases_the_base_and_requests_of_arms_are_refused() {
     let joints = SteeringIntent::Joints { position: vec![] };
     let joints = test.command(Some(500), joints);
     let outcome = test.cycle(&[(ANA, joints)]);
-    assert!(outcome.refusals[0].2.contains("only the base is steered"));
+    assert!(refusal(&outcome).2.contains("only the base is steered"));
     let outcome = test.cycle(&[(BEN, SteeringRequest::TakeLease)]);
-    assert_eq!(outcome.refusals[0].1, RefusedRequest::Lease);
-    assert!(!outcome.ends_tour);
+    assert_eq!(refusal(&outcome).1, RefusedRequest::Lease);
+    assert!(!outcome.begins && !outcome.ends_tour);
     test.cycle(&[(ANA, SteeringRequest::Disconnected)]);
     let began = Instant::now();
     loop {
-        let state = test.cycle(&[]).state;
+        let state = test.cycle(&[]).state.expect("a state");
         let is_at_rest = test.drive.port().state().is_some_and(|it| it.is_at_rest);
         if is_at_rest && state.holder.is_none() {
             break;
@@ -256,7 +275,7 @@ fn nobody_can_drive_a_base_before_it_has_reported() {
     }
     let mut test = Test::new();
     test.drive = BaseDrive::start(Box::new(SilentBase), LIMITS).expect("valid limits");
-    test.base_loop = BaseLoop::new(
+    test.base_loop = SteeringLoop::of_base(
         BaseSteeringConfig::new(LIMITS),
         test.drive.port().clone(),
         TimeBase::now(),
@@ -269,6 +288,7 @@ fn nobody_can_drive_a_base_before_it_has_reported() {
         test.grip += 1;
         let closed = test.command(Some(test.grip), forward(0.1));
         let state = test.cycle(&[(ANA, open), (ANA, closed)]).state;
+        let state = state.expect("a state");
         assert_eq!(state.base.and_then(|base| base.target), None);
         let text = &state.limits[0].text;
         if text.contains("has reported no state") {

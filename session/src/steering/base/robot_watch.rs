@@ -11,16 +11,16 @@ use viz::RobotState;
 
 /// State of a robot besides the report of its base.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct SeenRobot {
+pub(in crate::steering) struct SeenRobot {
     /// Pose of the base link on the floor.
-    pub(super) pose: Option<SeenPose>,
+    pub(in crate::steering) pose: Option<SeenPose>,
     /// Posture of the arm; `None` without an arm.
-    pub(super) posture: Option<SeenPosture>,
+    pub(in crate::steering) posture: Option<SeenPosture>,
 }
 
 /// The newest state of a robot.
 #[derive(Debug)]
-pub(super) struct RobotWatch {
+pub(in crate::steering) struct RobotWatch {
     times: TimeBase,
     newest: Mutex<Newest>,
 }
@@ -32,11 +32,13 @@ struct Newest {
     poses: PoseTracker,
     /// Posture in the report of the arm itself.
     posture: Option<SeenPosture>,
+    /// Poses that the input has delivered, for bases whose device reports nothing itself.
+    delivered_poses: PoseTracker,
 }
 
 impl RobotWatch {
     /// Nothing is known yet.
-    pub(super) fn new(times: TimeBase) -> Self {
+    pub(in crate::steering) fn new(times: TimeBase) -> Self {
         Self {
             times,
             newest: Mutex::default(),
@@ -44,13 +46,13 @@ impl RobotWatch {
     }
 
     /// The clocks of stamps and instants.
-    pub(super) fn times(&self) -> TimeBase {
+    pub(in crate::steering) fn times(&self) -> TimeBase {
         self.times
     }
 
     /// The newest state. Reports of the devices themselves come first, because the input of the run
     /// waits for a busy trainer.
-    pub(super) fn seen(&self) -> SeenRobot {
+    pub(in crate::steering) fn seen(&self) -> SeenRobot {
         let newest = self.newest.lock();
         let reported = newest.poses.newest();
         let reported = reported.map(|(at, world_from_base)| seen_pose(at, &world_from_base));
@@ -61,15 +63,34 @@ impl RobotWatch {
         }
     }
 
+    /// Pose of the base in the map at a time, as far as it is known.
+    pub(in crate::steering) fn world_from_base(&self, at: Stamp) -> Option<Transform> {
+        let newest = self.newest.lock();
+        let delivered = || newest.delivered_poses.at(at);
+        newest.poses.at(at).or_else(delivered)
+    }
+
+    /// The newest correction of the poses that the device of the base reports.
+    pub(in crate::steering) fn map_from_odom(&self) -> Option<Transform> {
+        self.newest.lock().poses.map_from_odom()
+    }
+
+    /// The newest pose of the base in the map, with its time.
+    pub(in crate::steering) fn newest_pose(&self) -> Option<(Stamp, Transform)> {
+        let newest = self.newest.lock();
+        let delivered = || newest.delivered_poses.newest();
+        newest.poses.newest().or_else(delivered)
+    }
+
     /// Notes a pose that the base has reported, without the corrections of stations.
-    pub(super) fn report_pose(&self, at: Stamp, odom_from_base: Transform) {
+    pub(in crate::steering) fn report_pose(&self, at: Stamp, odom_from_base: Transform) {
         self.newest.lock().poses.report(at, odom_from_base);
     }
 
     /// Notes a joint state that the arm has reported.
     ///
     /// * `offsets`: added to the positions; empty if there are none.
-    pub(super) fn report_joints(&self, joints: &JointState, offsets: &[f64]) {
+    pub(in crate::steering) fn report_joints(&self, joints: &JointState, offsets: &[f64]) {
         let offset = |ix: usize| offsets.get(ix).copied().unwrap_or(0.0);
         let positions = joints.position.iter().enumerate();
         self.newest.lock().posture = Some(SeenPosture {
@@ -83,6 +104,9 @@ impl RobotWatch {
         let has_arm = !state.positions.is_empty();
         let mut newest = self.newest.lock();
         newest.poses.correct(state.stamp, &state.world_from_base);
+        newest
+            .delivered_poses
+            .report_in_map(state.stamp, state.world_from_base);
         newest.delivered = SeenRobot {
             pose: Some(seen_pose(at, &state.world_from_base)),
             posture: has_arm.then(|| SeenPosture {

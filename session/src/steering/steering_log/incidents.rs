@@ -1,14 +1,17 @@
 //! Incidents in a steering log: changes of control, stops, brakes, refusals, and where the arm
 //! was.
 
-use super::line::{BaseStart, Line, Start};
+use super::line::{Line, Start};
 use super::reader::LogReader;
-use kinematics::{Chain, Stamp};
+use kinematics::{Chain, Stamp, transform};
+use nalgebra::Point3;
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::mem::{Discriminant, discriminant};
 use std::path::{Path, PathBuf};
-use steering::{BaseEntry, Effect, Entry, Limit, Link, Operator, Reason, Request, SeenPose};
+use steering::{
+    ArmCycle, BaseCycle, Effect, Entry, Limit, Link, Operator, Reason, Request, SeenPose,
+};
 
 /// Number of incidents that are kept, the newest ones.
 const MAX_INCIDENTS: usize = 2000;
@@ -32,7 +35,8 @@ pub struct Incidents {
     pub began_unix_millis: u64,
     /// Time from the beginning of the log to its end.
     pub seconds: f64,
-    /// Pose of the base of the arm: x, y, z in meters, and a quaternion x, y, z, w.
+    /// Pose of the frame of all places in the world: that of the arm's base, or no motion if the base
+    /// is steered. x, y, z in meters, and a quaternion x, y, z, w.
     pub world_from_base: [f64; 7],
     /// Names of the joints, in the order of all positions.
     pub joint_names: Vec<String>,
@@ -55,7 +59,8 @@ pub struct Incident {
     pub kind: IncidentKind,
     /// Description in words.
     pub text: String,
-    /// Where it happened, in the frame of the arm's base, meters.
+    /// Where it happened: in the frame of the arm's base, or in the world if the base is steered,
+    /// meters.
     pub place: Option<[f64; 3]>,
     /// The operator in control.
     pub operator: Option<u64>,
@@ -125,9 +130,9 @@ struct History {
     target: Option<Vec<f64>>,
     /// The last decision; `None` before the first, and after missing entries.
     decided: Option<Decided>,
-    /// Whether the log belongs to a base.
-    is_base: bool,
-    /// Its pose.
+    /// What a stop of the robot stops.
+    robot: &'static str,
+    /// Pose of the base, if it is steered.
     world_from_base: Option<[f64; 7]>,
     holder: Option<Operator>,
     view: Option<[f64; 7]>,
@@ -139,6 +144,12 @@ struct History {
     tracked_until_secs: f64,
     /// Limits and refusals that were applied last at a time.
     episodes: Vec<(Episode, Stamp)>,
+}
+
+/// A limit, and the place of its reason.
+struct PlacedLimit {
+    limit: Limit,
+    place: Option<[f64; 3]>,
 }
 
 /// The parts of a decision from which incidents follow.
@@ -162,8 +173,6 @@ impl History {
             match line {
                 Line::Start(start) => self.start(&start),
                 Line::Entry(entry) => self.entry(&entry),
-                Line::BaseStart(start) => self.start_base(&start),
-                Line::BaseEntry(entry) => self.base_entry(&entry),
                 Line::View(view) => self.view = Some(view.world_from_camera),
                 Line::Missing(_) => self.decided = None,
                 Line::End(end) => self.advance(end.at),
@@ -175,21 +184,23 @@ impl History {
 
     fn start(&mut self, start: &Start) {
         self.begin(start.at, start.unix_millis, &start.program);
-        self.found.world_from_base = start.world_from_base;
         let setup = &start.setup;
-        if let Ok(chain) = Chain::from_urdf(&setup.urdf, &setup.base_link, &setup.tip_link) {
-            self.found.joint_names = chain.joint_names().to_vec();
-        }
-        self.advance(start.at);
-    }
-
-    /// Places of a base are in the world.
-    fn start_base(&mut self, start: &BaseStart) {
-        self.begin(start.at, start.unix_millis, &start.program);
-        self.found.world_from_base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-        self.is_base = true;
-        if let Some(stowed) = &start.setup.config.stowed {
+        self.found.world_from_base = match &setup.base {
+            Some(_) => [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+            None => start.world_from_base,
+        };
+        self.robot = match (&setup.arm, &setup.base) {
+            (Some(_), Some(_)) => "robot",
+            (None, Some(_)) => "base",
+            (_, None) => "arm",
+        };
+        if let Some(stowed) = setup.base.as_ref().and_then(|base| base.stowed.as_ref()) {
             self.found.joint_names.clone_from(&stowed.joints);
+        }
+        if let Some(arm) = &setup.arm
+            && let Ok(chain) = Chain::from_urdf(&arm.urdf, &arm.base_link, &arm.tip_link)
+        {
+            self.found.joint_names = chain.joint_names().to_vec();
         }
         self.advance(start.at);
     }
@@ -208,54 +219,68 @@ impl History {
     }
 
     fn entry(&mut self, entry: &Entry) {
+        self.advance(entry.at());
         match entry {
             Entry::Request {
-                at,
-                request,
-                refusal,
-            } => {
-                self.advance(*at);
-                self.answer(request, refusal.as_ref());
-            }
-            Entry::Cycle {
-                at, arm, verdict, ..
-            } => {
-                self.advance(*at);
-                self.position.clone_from(&arm.position);
-                let target = verdict.target();
-                self.cycle(&verdict.limits, target.is_some());
-                self.target = target.map(|target| target.position.clone());
-                self.sample();
-            }
+                request, refusal, ..
+            } => self.answer(request, refusal.as_ref()),
+            Entry::Cycle { arm, base, .. } => self.robot_cycle(arm.as_deref(), base.as_deref()),
         }
     }
 
-    fn base_entry(&mut self, entry: &BaseEntry) {
-        match entry {
-            BaseEntry::Request {
-                at,
-                request,
-                refusal,
-            } => {
-                self.advance(*at);
-                self.answer(request, refusal.as_ref());
+    fn robot_cycle(&mut self, arm: Option<&ArmCycle>, base: Option<&BaseCycle>) {
+        if let Some(base) = base {
+            let situation = &base.situation;
+            if let Some(seen) = &situation.pose {
+                self.world_from_base = Some(pose_numbers(seen));
             }
-            BaseEntry::Cycle {
-                at,
-                situation,
-                verdict,
-            } => {
-                self.advance(*at);
-                if let Some(seen) = &situation.pose {
-                    self.world_from_base = Some(pose_numbers(seen));
-                }
-                if let Some(arm) = &situation.arm {
-                    self.position.clone_from(&arm.position);
-                }
-                self.cycle(&verdict.limits, verdict.target().is_some());
-                self.sample();
+            if let Some(arm) = &situation.arm {
+                self.position.clone_from(&arm.position);
             }
         }
+        if let Some(arm) = arm {
+            self.position.clone_from(&arm.state.position);
+        }
+        let arm_target = arm.and_then(|arm| arm.verdict.target());
+        let is_following =
+            arm_target.is_some() || base.is_some_and(|base| base.verdict.target().is_some());
+        let limits = self.limits(arm, base);
+        self.cycle(&limits, is_following);
+        self.target = arm_target.map(|target| target.position.clone());
+        self.sample();
+    }
+
+    /// The limits of all parts. A part that rests because its operator moves the other one is no
+    /// incident.
+    fn limits(&self, arm: Option<&ArmCycle>, base: Option<&BaseCycle>) -> Vec<PlacedLimit> {
+        let of_arm = arm.map_or(&[][..], |arm| &arm.verdict.limits);
+        let of_base = base.map_or(&[][..], |base| &base.verdict.limits);
+        let world_from_base = self.world_from_base.map(transform::from_xyz_xyzw);
+        let mut limits: Vec<PlacedLimit> = Vec::new();
+        for limit in of_arm {
+            let place = limit.reason.place();
+            // With a base that is steered, all places are in the world.
+            let moved = |place: [f64; 3]| match &world_from_base {
+                Some(pose) => (pose * Point3::from(place)).into(),
+                None => place,
+            };
+            limits.push(PlacedLimit {
+                limit: limit.clone(),
+                place: place.map(moved),
+            });
+        }
+        for limit in of_base {
+            if !of_arm.contains(limit) {
+                limits.push(PlacedLimit {
+                    limit: limit.clone(),
+                    place: limit.reason.place(),
+                });
+            }
+        }
+        let is_incident =
+            |it: &PlacedLimit| !matches!(it.limit.reason, Reason::ArmHasGrip | Reason::BaseHasGrip);
+        limits.retain(is_incident);
+        limits
     }
 
     fn answer(&mut self, request: &Request, refusal: Option<&Reason>) {
@@ -272,7 +297,7 @@ impl History {
             Request::Rearm { .. } => "permission to move",
             _ => "control",
         };
-        self.episode(IncidentKind::Refused, reason, || {
+        self.episode(IncidentKind::Refused, (reason, reason.place()), || {
             format!("{what} was refused: {reason}")
         });
     }
@@ -303,7 +328,7 @@ impl History {
             }
             Request::Stop { by } => {
                 let who = by.map_or("the program".to_owned(), |operator| operator.to_string());
-                let what = if self.is_base { "base" } else { "arm" };
+                let what = self.robot;
                 self.add(
                     IncidentKind::Stop,
                     format!("{who} stopped the {what}"),
@@ -322,22 +347,23 @@ impl History {
         }
     }
 
-    fn cycle(&mut self, limits: &[Limit], is_following: bool) {
+    fn cycle(&mut self, limits: &[PlacedLimit], is_following: bool) {
         let before = self.decided.replace(Decided {
-            limits: limits.to_vec(),
+            limits: limits.iter().map(|it| it.limit.clone()).collect(),
             is_following,
         });
-        for limit in limits {
+        for PlacedLimit { limit, place } in limits {
+            let text = || limit.to_string();
             match limit.effect {
-                Effect::Braked => self.brake(limit, before.as_ref()),
+                Effect::Braked => self.brake(limit, *place, before.as_ref()),
                 Effect::Refused => {
-                    self.episode(IncidentKind::Refused, &limit.reason, || limit.to_string())
+                    self.episode(IncidentKind::Refused, (&limit.reason, *place), text);
                 }
                 // Limits of speed apply to nearly every motion.
                 Effect::Slowed(_)
                     if matches!(limit.link, Link::SelfCollision | Link::Clearance) =>
                 {
-                    self.episode(IncidentKind::Slowed, &limit.reason, || limit.to_string());
+                    self.episode(IncidentKind::Slowed, (&limit.reason, *place), text);
                 }
                 Effect::Slowed(_) => {}
             }
@@ -345,7 +371,7 @@ impl History {
     }
 
     /// The arm must be at rest in this cycle.
-    fn brake(&mut self, limit: &Limit, before: Option<&Decided>) {
+    fn brake(&mut self, limit: &Limit, place: Option<[f64; 3]>, before: Option<&Decided>) {
         let reason = &limit.reason;
         let is_same = |other: &Limit| {
             other.effect == Effect::Braked && discriminant(&other.reason) == discriminant(reason)
@@ -368,7 +394,7 @@ impl History {
         if !is_new {
             return;
         }
-        self.add(kind, limit.to_string(), reason.place());
+        self.add(kind, limit.to_string(), place);
         if kind == IncidentKind::Lease {
             self.holder = None;
         }
@@ -413,7 +439,12 @@ impl History {
     }
 
     /// Adds an incident unless it continues an earlier one.
-    fn episode(&mut self, kind: IncidentKind, reason: &Reason, text: impl FnOnce() -> String) {
+    fn episode(
+        &mut self,
+        kind: IncidentKind,
+        (reason, place): (&Reason, Option<[f64; 3]>),
+        text: impl FnOnce() -> String,
+    ) {
         let episode = Episode {
             kind,
             reason: discriminant(reason),
@@ -430,7 +461,7 @@ impl History {
             return;
         }
         self.episodes.push((episode, now));
-        self.add(kind, text(), reason.place());
+        self.add(kind, text(), place);
     }
 
     fn add(&mut self, kind: IncidentKind, text: String, place: Option<[f64; 3]>) {

@@ -3,10 +3,10 @@
 use drivers::motion::exact;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use steering::{BaseEntry, BaseSetup, Entry, Setup};
+use steering::{Entry, Setup};
 
 /// Version of the format. Logs of other versions are refused, because their replay would differ.
-pub(in crate::steering) const VERSION: u64 = 1;
+pub(in crate::steering) const VERSION: u64 = 2;
 
 /// One line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -17,10 +17,6 @@ pub(in crate::steering) enum Line {
     Start(Box<Start>),
     /// A request or a cycle.
     Entry(Box<Entry>),
-    /// The first line of the log of a base, and the first one after missing entries.
-    BaseStart(Box<BaseStart>),
-    /// A request or a cycle of a base.
-    BaseEntry(Box<BaseEntry>),
     /// New view of the holder of the lease.
     View(View),
     /// Entries are missing here, because the disk was too slow.
@@ -42,27 +38,11 @@ pub(in crate::steering) struct Start {
     pub(in crate::steering) at: Stamp,
     /// The same moment on the wall clock, milliseconds since 1970.
     pub(in crate::steering) unix_millis: u64,
-    /// Pose of the base of the arm: x, y, z in meters, and a quaternion x, y, z, w.
+    /// Pose of the base of the arm, unless the base is steered: x, y, z in meters, and a quaternion
+    /// x, y, z, w.
     pub(in crate::steering) world_from_base: [f64; 7],
     /// Configuration, robot, limits and state.
     pub(in crate::steering) setup: Setup,
-}
-
-/// Setup of a base for all further lines.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(in crate::steering) struct BaseStart {
-    /// [`VERSION`].
-    pub(in crate::steering) version: u64,
-    /// Version and processor of the program.
-    pub(in crate::steering) program: String,
-    /// Now on the clock of the entries.
-    #[serde(with = "exact::stamp")]
-    pub(in crate::steering) at: Stamp,
-    /// The same moment on the wall clock, milliseconds since 1970.
-    pub(in crate::steering) unix_millis: u64,
-    /// Configuration, limits and state.
-    pub(in crate::steering) setup: BaseSetup,
 }
 
 /// A time on the clock of the entries.

@@ -1,8 +1,7 @@
 //! A session of the chain of decisions is logged, read and replayed, also from damaged files.
 
 use super::line::Line;
-use super::logged_chain::About;
-use super::loop_log::LoopLog;
+use super::loop_log::{About, LoopLog};
 use super::place::{FILE, OLDER_FILE, files_of};
 use super::reader::LogReader;
 use super::writer::{LogWriter, MAX_WAITING};
@@ -217,7 +216,7 @@ fn changed_target_and_changed_byte_are_found() {
     let mut changed = lines(&file);
     let target = changed.iter_mut().rev().find_map(|line| match line {
         Line::Entry(entry) => match &mut **entry {
-            steering::Entry::Cycle { verdict, .. } => match &mut verdict.output {
+            steering::Entry::Cycle { arm, .. } => match &mut arm.as_mut()?.verdict.output {
                 steering::Output::Follow(target) => Some(target),
                 steering::Output::Brake => None,
             },

@@ -9,7 +9,6 @@ mod incidents;
 mod line;
 #[cfg(test)]
 mod log_tests;
-mod logged_chain;
 mod loop_log;
 mod place;
 mod reader;
@@ -17,8 +16,7 @@ mod replay;
 mod writer;
 
 pub use incidents::{Incident, IncidentKind, Incidents, Sample, incidents};
-pub(super) use logged_chain::About;
-pub(super) use loop_log::LoopLog;
+pub(super) use loop_log::{About, LoopLog};
 pub use place::files_of;
 pub(crate) use place::{FILE, OLDER_FILE};
 pub use replay::{Replayed, replay};

@@ -25,7 +25,7 @@ pub(super) struct LogReader {
     other_version: Option<u64>,
 }
 
-/// A start of any version, of an arm or of a base.
+/// A start of any version. In version 1, bases had a start of their own.
 #[derive(Deserialize)]
 struct AnyStart {
     #[serde(alias = "base_start")]
@@ -143,10 +143,7 @@ impl LogReader {
             ))
             .into());
         }
-        let is_log = matches!(
-            self.lines.front(),
-            Some(Line::Start(_) | Line::BaseStart(_))
-        );
+        let is_log = matches!(self.lines.front(), Some(Line::Start(_)));
         if std::mem::replace(&mut self.is_first, false) && !is_log {
             let why = match &self.damage {
                 Some(damage) => damage.as_str(),

@@ -7,7 +7,7 @@ use kinematics::Stamp;
 use messages::counted;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use steering::{BaseEntry, BaseSteering, Difference, Entry, Steering};
+use steering::{Entry, Steering};
 
 /// Results of a replay.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -86,13 +86,7 @@ struct Replay {
     result: Replayed,
     began: Option<Stamp>,
     /// `None` before the first start, and after missing entries.
-    chain: Option<Chain>,
-}
-
-/// The chain whose decisions are repeated.
-enum Chain {
-    Arm(Box<Steering>),
-    Base(Box<BaseSteering>),
+    chain: Option<Steering>,
 }
 
 impl Replay {
@@ -115,50 +109,25 @@ impl Replay {
         match line {
             Line::Start(start) => {
                 self.began.get_or_insert(start.at);
-                self.chain = Some(Chain::Arm(Box::new(start.setup.build()?)));
-                self.result.program = start.program;
-            }
-            Line::BaseStart(start) => {
-                self.began.get_or_insert(start.at);
-                self.chain = Some(Chain::Base(Box::new(start.setup.build()?)));
+                self.chain = Some(start.setup.build()?);
                 self.result.program = start.program;
             }
             Line::Missing(n_entries) => {
                 self.result.missing += n_entries;
                 self.chain = None;
             }
-            Line::Entry(entry) => self.repeat_arm(&entry),
-            Line::BaseEntry(entry) => self.repeat_base(&entry),
+            Line::Entry(entry) => self.repeat(&entry),
             Line::View(_) | Line::End(_) => {}
         }
         Ok(())
     }
 
-    fn repeat_arm(&mut self, entry: &Entry) {
-        let Some(Chain::Arm(steering)) = &mut self.chain else {
+    fn repeat(&mut self, entry: &Entry) {
+        let Some(steering) = &mut self.chain else {
             return;
         };
-        let repeated = steering.replay(entry);
-        let (Entry::Request { at, .. } | Entry::Cycle { at, .. }) = entry;
-        let is_target = matches!(entry, Entry::Cycle { verdict, .. } if verdict.target().is_some());
-        self.note(*at, repeated, is_target);
-    }
-
-    fn repeat_base(&mut self, entry: &BaseEntry) {
-        let Some(Chain::Base(steering)) = &mut self.chain else {
-            return;
-        };
-        let repeated = steering.replay(entry);
-        let (BaseEntry::Request { at, .. } | BaseEntry::Cycle { at, .. }) = entry;
-        let is_target =
-            matches!(entry, BaseEntry::Cycle { verdict, .. } if verdict.target().is_some());
-        self.note(*at, repeated, is_target);
-    }
-
-    /// Notes the result of a repeated decision.
-    fn note(&mut self, at: Stamp, repeated: Result<(), Difference>, is_target: bool) {
         let began = self.began.unwrap_or_default();
-        if let Err(difference) = repeated {
+        if let Err(difference) = steering.replay(entry) {
             self.result.difference = Some(FirstDifference {
                 seconds: difference.at.secs_since(began),
                 replayed: difference.replayed,
@@ -166,8 +135,8 @@ impl Replay {
             });
             return;
         }
-        self.result.seconds = at.secs_since(began);
+        self.result.seconds = entry.at().secs_since(began);
         self.result.decisions += 1;
-        self.result.targets += u64::from(is_target);
+        self.result.targets += u64::from(entry.has_target());
     }
 }

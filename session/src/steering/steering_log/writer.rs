@@ -171,7 +171,7 @@ impl Files {
 
     fn write(&mut self, line: &Line) -> std::io::Result<()> {
         let is_full = self.current.as_ref().is_none_or(|file| file.is_full);
-        let is_start = matches!(line, Line::Start(_) | Line::BaseStart(_));
+        let is_start = matches!(line, Line::Start(_));
         if is_full && is_start {
             self.begin()?;
         }

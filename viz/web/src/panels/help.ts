@@ -35,6 +35,7 @@ const STEER_KEYS: Group = {
     ["Q E", "Hand down and up"],
     ["← → ↑ ↓", "Turn left and right, nose up and down"],
     ["Z C", "Roll left and right"],
+    ["1 2", "Move the arm, or the base under it"],
   ],
 };
 const STEER_PAD: Group = {
@@ -44,7 +45,8 @@ const STEER_PAD: Group = {
     ["Left stick, D-pad", "Hand left, right, forward, back; up and down"],
     ["Right stick, shoulders", "Turn and nose up and down; roll"],
     ["Trigger and lower button", "Go to the ghost, while held"],
-    ["Right button", "Stop the arm"],
+    ["Right button", "Stop the robot"],
+    ["Upper button", "Switch between arm and base, while no trigger is held"],
   ],
 };
 const CLOSE_KEYS: Group = {

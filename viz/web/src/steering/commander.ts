@@ -21,7 +21,7 @@ import {
 } from "./jog";
 import type { PadInput } from "./gamepad";
 import { LeaseKeeper } from "./lease_keeper";
-import type { Arm, Intent, Point, SteerMessage, SteerRequest, SteerState } from "./messages";
+import type { Arm, Intent, Part, Point, SteerMessage, SteerRequest, SteerState } from "./messages";
 import { type HandSpeed, integrated, numbersOf, type Pose, poseOf, slewed } from "./pose";
 import { capitalized } from "../panels/sentence";
 
@@ -52,6 +52,8 @@ export class Commander {
   arm: Arm | null = null;
   state: SteerState | null = null;
   frame: FrameName = "view";
+  /** The part that the operator has chosen, if the robot has two. */
+  private chosenPart: Part = "arm";
   /** Speed of jogging, 0 to 1. */
   speed = 0.3;
   readonly goal = new Goal();
@@ -85,8 +87,9 @@ export class Commander {
   private hasArrived = false;
   /** Whether the triggers of the gamepad were seen open since the page has paid attention to it. */
   private isPadReady = false;
-  /** Whether the gamepad's button for a stop is down. */
+  /** Whether the gamepad's button for a stop is down, and the one that switches between arm and base. */
   private isPadStop = false;
+  private isPadSwitch = false;
 
   /** `device` differs from that of every other page, because each one counts its grips from the beginning. */
   constructor(
@@ -98,6 +101,36 @@ export class Commander {
 
   get hasControl(): boolean {
     return this.isConnected && this.arm !== null && this.state?.holder === this.arm.client;
+  }
+
+  /** Whether operators move both the arm and the base. */
+  get hasBothParts(): boolean {
+    return this.arm !== null && this.arm.base !== null && this.arm.joints.length > 0;
+  }
+
+  /** The part that all inputs move. */
+  get part(): Part {
+    if (this.hasBothParts) return this.chosenPart;
+    return this.arm?.base ? "base" : "arm";
+  }
+
+  /** Chooses the part that all inputs move. A part that moves brakes. */
+  choosePart(part: Part): void {
+    if (!this.hasBothParts || part === this.chosenPart) return;
+    this.interrupt(`the ${part} was chosen`);
+    this.jogs.clear();
+    this.goal.clear();
+    this.setBaseGoal(null);
+    this.goIntent = null;
+    this.chosenPart = part;
+  }
+
+  /** Makes the stowed posture of the arm its goal. */
+  stow(): void {
+    const stowed = this.arm?.base?.stowed;
+    if (!stowed || !this.hasBothParts) return;
+    this.choosePart("arm");
+    this.preview(stowed);
   }
 
   /** Whether a press moves the arm or the goal. */
@@ -125,7 +158,7 @@ export class Commander {
 
   get mode(): Mode {
     // A velocity of a base needs no preview: over a slow link, the base brakes as soon as commands are late.
-    if (this.arm?.base) return "servo";
+    if (this.part === "base") return "servo";
     return this.previewsAlways ? "preview" : this.chosen;
   }
 
@@ -146,7 +179,7 @@ export class Commander {
 
   /** Where the gizmo is: at the hand, at the goal, or at the tip of the arm. In the base; null without an arm. */
   get gizmo(): Pose | null {
-    if (this.arm?.base) return null;
+    if (this.part === "base") return null;
     if (this.hand && this.deadMan.source === "gizmo") return this.hand.now;
     return this.goalTip() ?? (this.state && poseOf(this.state.base_from_tip));
   }
@@ -316,7 +349,7 @@ export class Commander {
     }
     const before = this.goIntent;
     // The press sends the first sample of the grip, which must have the intent.
-    this.goIntent = this.arm?.base ? this.baseGoalIntent() : this.goal.intent;
+    this.goIntent = this.part === "base" ? this.baseGoalIntent() : this.goal.intent;
     if (!this.deadMan.press(source, this.goIntent !== null)) this.goIntent = before;
   }
 
@@ -337,7 +370,7 @@ export class Commander {
     if (!isNew) return;
     const isPreview = this.mode === "preview";
     const axes = this.axesNow();
-    const hasAxes = jog.kind === "joint" || axes !== null || this.arm?.base != null;
+    const hasAxes = jog.kind === "joint" || axes !== null || this.part === "base";
     if (!hasAxes) this.events.notice("The pose of the robot in the view is not known yet: choose the frame of the tool or the base");
     this.deadMan.press(source, hasAxes && !isPreview);
     if (isPreview && hasAxes && this.maySteer && !this.nudge) this.nudge = { source, axes };
@@ -349,6 +382,9 @@ export class Commander {
    */
   setPad(input: PadInput | null, hasAttention = true): void {
     const isStop = input?.isStop === true;
+    const isSwitch = input?.isSwitch === true && hasAttention && !input.isHeld;
+    if (isSwitch && !this.isPadSwitch) this.choosePart(this.part === "arm" ? "base" : "arm");
+    this.isPadSwitch = isSwitch;
     // During a recovery, the arm is stopped already, so that each press is one more stop.
     if (isStop && this.canMove && (this.state?.stop === null || !this.isPadStop)) this.stop();
     this.isPadStop = isStop;
@@ -468,7 +504,7 @@ export class Commander {
     const jog = source && this.jogs.get(source);
     const { arm } = this;
     if (!jog || !arm) return null;
-    if (arm.base) return jog.kind === "tip" ? baseIntent(arm.base, jog.deflection, this.speed) : null;
+    if (arm.base && this.part === "base") return jog.kind === "tip" ? baseIntent(arm.base, jog.deflection, this.speed) : null;
     if (jog.kind === "joint") {
       return { kind: "joint_velocity", velocity: jointVelocities(arm.joints, jog.ix, jog.direction, this.speed) };
     }

@@ -10,6 +10,8 @@ const PULLED = 0.5;
 
 const SOUTH = 0;
 const EAST = 1;
+/** Y on most gamepads. */
+const NORTH = 3;
 const [LEFT_SHOULDER, RIGHT_SHOULDER] = [4, 5];
 const TRIGGERS = [6, 7];
 const [DPAD_UP, DPAD_DOWN] = [12, 13];
@@ -27,6 +29,8 @@ export interface PadInput {
   /** Whether the button "go" is held besides. */
   isGo: boolean;
   isStop: boolean;
+  /** Whether the button is down that switches between arm and base. */
+  isSwitch: boolean;
   deflection: Deflection;
 }
 
@@ -41,6 +45,7 @@ export function padInput({ mapping, axes, buttons }: PadState): PadInput | null 
     isHeld,
     isGo: isHeld && isPressed(SOUTH),
     isStop: isPressed(EAST),
+    isSwitch: isPressed(NORTH),
     deflection: {
       right: leftX,
       forward: negated(leftY), // Sticks are positive toward the operator.

@@ -4,8 +4,11 @@ import { isKeptByFocus, isPageCovered, isPressed, type toggle } from "../keys";
 import { element } from "../panels/element";
 import type { Commander } from "./commander";
 import { deflectionOfKeys, JOG_KEYS } from "./jog";
+import type { Part } from "./messages";
 
 const BUTTON = "steer-keys";
+/** The keys that choose the part of the robot which the other keys move. */
+const PART_KEYS: Readonly<Record<string, Part>> = { Digit1: "arm", Digit2: "base" };
 
 export class JogKeys {
   private readonly held = new Set<string>();
@@ -13,6 +16,7 @@ export class JogKeys {
   constructor(
     private readonly commander: Commander,
     addToggle: typeof toggle,
+    private readonly choosePart: (part: Part) => void,
   ) {
     const switched = (isOn: boolean): void => {
       this.release();
@@ -46,10 +50,16 @@ export class JogKeys {
     const { code, repeat } = event;
     // While Meta is down, macOS does not report the release of other keys.
     if (event.metaKey) this.release();
-    if (!isPressed(BUTTON) || !(code in JOG_KEYS) || isKeptByFocus(event) || isPageCovered()) return;
+    const part = this.commander.hasBothParts ? PART_KEYS[code] : undefined;
+    if (!isPressed(BUTTON) || !(code in JOG_KEYS || part) || isKeptByFocus(event) || isPageCovered()) return;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     event.stopImmediatePropagation();
+    if (part) {
+      this.release();
+      this.choosePart(part);
+      return;
+    }
     // A key that was held before the page got the focus repeats. It does not count before it is pressed anew.
     if (repeat) return;
     this.held.add(code);

@@ -7,7 +7,7 @@ import { disable } from "../panels/title";
 import { showToast } from "../panels/toast";
 import type { Commander } from "./commander";
 import type { SteerRequest } from "./messages";
-import { leaseText } from "./texts";
+import { leaseText, robotName } from "./texts";
 
 export class LeasePanel {
   private readonly take = element("steer-take", HTMLButtonElement);
@@ -30,7 +30,7 @@ export class LeasePanel {
   show(): void {
     const { arm, state, isOpen, hasControl } = this.commander;
     const isKnown = isOpen && arm !== null && state !== null;
-    setText(element("steer-lease"), isKnown ? leaseText(state, arm.client, arm.base ? "base" : "arm") : "No link to the robot");
+    setText(element("steer-lease"), isKnown ? leaseText(state, arm.client, this.robot) : "No link to the robot");
     element("toggle-steer").dataset.control = hasControl ? "own" : typeof state?.holder === "number" ? "other" : "nobody";
     this.take.hidden = hasControl;
     disable(this.take, this.reasonAgainstTaking());
@@ -43,10 +43,15 @@ export class LeasePanel {
     this.announceOffer();
   }
 
+  private get robot(): string {
+    const { arm } = this.commander;
+    return robotName(arm === null || arm.joints.length > 0, arm?.base != null);
+  }
+
   /** Why nobody can take control here now; empty if it is possible. */
   private reasonAgainstTaking(): string {
     const { arm, state, isOpen } = this.commander;
-    if (!arm || !state || !isOpen) return "There is no link to the arm";
+    if (!arm || !state || !isOpen) return "There is no link to the robot";
     if (!arm.may_steer) return "Only operators can steer. You are connected as viewer: ask for an operator's link";
     const isFree = state.holder === null || state.offered_to === arm.client;
     return isFree ? "" : `Operator ${state.holder} has control: ask for it`;
@@ -69,7 +74,7 @@ export class LeasePanel {
     const { arm, state } = this.commander;
     const isOffered = state !== null && state.holder !== null && state.offered_to === arm?.client;
     if (isOffered && !this.isOffered) {
-      const text = `Operator ${state.holder} offers you control of the arm: press Take control under Steer`;
+      const text = `Operator ${state.holder} offers you control of the ${this.robot}: press Take control under Steer`;
       announce(text);
       showToast(text);
     }
@@ -82,7 +87,7 @@ export class LeasePanel {
     if (holder === this.holder) return;
     const had = this.holder === arm?.client;
     this.holder = holder;
-    if (holder === arm?.client) announce("You have control of the arm. Space stops it");
-    else if (had) announce("You no longer have control of the arm");
+    if (holder === arm?.client) announce(`You have control of the ${this.robot}. Space stops it`);
+    else if (had) announce(`You no longer have control of the ${this.robot}`);
   }
 }

@@ -6,7 +6,7 @@ import { element } from "../panels/element";
 import { child } from "../panels/html";
 import type { Commander } from "./commander";
 import type { Mark, Marks } from "./marks";
-import type { Limit, Point } from "./messages";
+import type { Limit, Part, Point } from "./messages";
 import type { Pose } from "./pose";
 import { limitText, shownLimits, verdictText } from "./texts";
 import { mayGo } from "./goal";
@@ -27,24 +27,27 @@ export class LimitsList {
     private readonly marks: Marks,
   ) {}
 
-  show(worldFromBase: Pose | null): void {
+  /** `frames`: those of the places of both parts in the world; null without a link. */
+  show(frames: Record<Part, Pose | null> | null): void {
     const { state, deadMan } = this.commander;
     const limits = shownLimits(state?.limits ?? [], deadMan.grip !== null);
     this.showList(limits.map((limit) => ({ key: `${limit.link} ${limit.effect}`, effect: limit.effect, text: limitText(limit) })));
-    this.marks.show(worldFromBase ? this.marksOf(limits, worldFromBase) : []);
+    this.marks.show(frames ? this.marksOf(limits, frames) : []);
   }
 
-  private marksOf(limits: readonly Limit[], { position, rotation }: Pose): Mark[] {
+  private marksOf(limits: readonly Limit[], frames: Record<Part, Pose | null>): Mark[] {
     const { judgment, target } = this.commander.goal;
-    const ofGoal: { place: Point | null; effect: string; text: string }[] = [];
+    const ofGoal: { part: Part; place: Point | null; effect: string; text: string }[] = [];
     if (target && judgment && judgment.verdict !== "reachable") {
       const { verdict, text, place } = judgment;
-      ofGoal.push({ place, effect: mayGo(verdict) ? "slowed" : "refused", text: verdictText(verdict, text) });
+      ofGoal.push({ part: "arm", place, effect: mayGo(verdict) ? "slowed" : "refused", text: verdictText(verdict, text) });
     }
-    const ofArm = limits.map((limit) => ({ place: limit.place, effect: limit.effect, text: limitText(limit) }));
-    return [...ofArm, ...ofGoal].flatMap(({ place, effect, text }) =>
-      place ? [{ worldPoint: new THREE.Vector3(...place).applyQuaternion(rotation).add(position), effect, text }] : [],
-    );
+    const applied = limits.map((limit) => ({ ...limit, text: limitText(limit) }));
+    return [...applied, ...ofGoal].flatMap(({ part, place, effect, text }) => {
+      const frame = frames[part];
+      if (!place || !frame) return [];
+      return [{ worldPoint: new THREE.Vector3(...place).applyQuaternion(frame.rotation).add(frame.position), effect, text }];
+    });
   }
 
   private showList(entries: { key: string; effect: string; text: string }[]): void {

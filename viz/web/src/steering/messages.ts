@@ -54,7 +54,15 @@ export interface SteeredBase {
   max_yaw_rad_s: number;
   /** Where it stays: smallest x and y, then largest x and y, in the world, meters. */
   area_m: Area | null;
+  /** What keeps the base away from obstacles. */
+  avoidance: Avoidance;
+  /** Joint values of the arm while the base moves; null without an arm. */
+  stowed: number[] | null;
 }
+
+export type Avoidance = "nothing" | "seen_surfaces" | "unknown_space";
+/** A part of the robot that an operator moves. */
+export type Part = "arm" | "base";
 
 export type Area = [number, number, number, number];
 
@@ -71,12 +79,14 @@ export interface Arm {
   lease_secs: number;
   /** Greatest round-trip time at which the arm follows the hand. */
   servo_round_trip_millis: number;
-  /** The base, if it is steered instead of an arm. */
+  /** The base, if it is steered. Without a steered arm, there are no joints. */
   base: SteeredBase | null;
 }
 
 /** A limit that was applied. */
 export interface Limit {
+  /** The part that is limited. Places are in the frame of the arm's base, and in the world for limits of the base. */
+  part: Part;
   link: string;
   effect: "slowed" | "refused" | "braked";
   /** Speed that is left, 0 to 1. */
@@ -104,6 +114,7 @@ export interface BaseState {
   world_from_base: Point | null;
   goal: Point | null;
   has_arrived: boolean;
+  is_moving: boolean;
 }
 
 export interface SteerState {
@@ -120,6 +131,8 @@ export interface SteerState {
   /** Whether the arm is being enabled after a fault. Motion is permitted afterward, unless somebody stops the arm. */
   is_recovering: boolean;
   is_moving: boolean;
+  /** The part that the operator moves; null while no dead-man switch is held. */
+  moved_part: Part | null;
   position: number[];
   target: number[] | null;
   base_from_tip: PoseNumbers;
@@ -128,7 +141,7 @@ export interface SteerState {
   applied: Applied | null;
   /** Contacts of the robot with a simulated scene. */
   contacts: number | null;
-  /** The base, if it is steered instead of an arm. */
+  /** The base, if it is steered. */
   base: BaseState | null;
   clients: SteerClient[];
 }
@@ -205,12 +218,16 @@ function baseIn(value: unknown): SteeredBase | null {
   const { max_forward_m_s, max_left_m_s, max_yaw_rad_s, area_m } = value;
   if (!isNumber(max_forward_m_s) || !isNumber(max_left_m_s) || !isNumber(max_yaw_rad_s)) return null;
   const area = areNumbers(area_m) && area_m.length === 4 ? (area_m as Area) : null;
-  return { max_forward_m_s, max_left_m_s, max_yaw_rad_s, area_m: area };
+  // A page that does not know what keeps the base away must not promise anything.
+  const avoidance = value.avoidance === "seen_surfaces" || value.avoidance === "unknown_space" ? value.avoidance : "nothing";
+  const stowed = areNumbers(value.stowed) ? value.stowed : null;
+  return { max_forward_m_s, max_left_m_s, max_yaw_rad_s, area_m: area, avoidance, stowed };
 }
 
 function baseStateIn(value: unknown): BaseState | null {
   if (!isFields(value)) return null;
-  return { world_from_base: pointOr(value.world_from_base), goal: pointOr(value.goal), has_arrived: value.has_arrived === true };
+  const places = { world_from_base: pointOr(value.world_from_base), goal: pointOr(value.goal) };
+  return { ...places, has_arrived: value.has_arrived === true, is_moving: value.is_moving === true };
 }
 
 function jointIn(value: unknown): ArmJoint | null {
@@ -232,6 +249,7 @@ function stateIn(fields: Fields): SteerState | null {
     stop_number: numberOr(fields.stop_number),
     is_recovering: fields.is_recovering === true,
     is_moving: fields.is_moving === true,
+    moved_part: fields.moved_part === "arm" || fields.moved_part === "base" ? fields.moved_part : null,
     position,
     target: areNumbers(fields.target) && fields.target.length === position.length ? fields.target : null,
     base_from_tip,
@@ -248,7 +266,8 @@ function limitIn(value: unknown): Limit | null {
   if (!isFields(value) || !isText(value.link) || !isText(value.text)) return null;
   const { link, text, effect } = value;
   if (effect !== "slowed" && effect !== "refused" && effect !== "braked") return null;
-  return { link, effect, text, speed_scale: numberOr(value.speed_scale) ?? 0, place: pointOr(value.place) };
+  const part = value.part === "base" ? "base" : "arm";
+  return { part, link, effect, text, speed_scale: numberOr(value.speed_scale) ?? 0, place: pointOr(value.place) };
 }
 
 function appliedIn(value: unknown): Applied | null {

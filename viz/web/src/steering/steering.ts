@@ -24,12 +24,12 @@ import { JogPad } from "./jog_pad";
 import { LeasePanel } from "./lease_panel";
 import { LimitsList } from "./limits_list";
 import { Marks } from "./marks";
-import type { Point, SteerMessage, SteerRequest } from "./messages";
+import type { Part, Point, SteerMessage, SteerRequest } from "./messages";
 import { numbersOf, type Pose, poseOf, poseOfMatrix } from "./pose";
 import { PoseList } from "./pose_list";
 import { SteerSocket } from "./steer_socket";
 import { StopButton } from "./stop_button";
-import { baseGoalText, baseText, modeText, verdictText } from "./texts";
+import { avoidanceText, baseGoalText, baseText, modeText, verdictText } from "./texts";
 
 // One script for both, because they draw the same ghost.
 export { Incidents } from "../incidents/incidents";
@@ -111,7 +111,7 @@ export class Steering {
     this.stopButton = new StopButton(this.commander, page.action, (stop) => send({ type: "rearm", stop }));
     this.lease = new LeasePanel(this.commander, send);
     this.jogPad = new JogPad(this.commander);
-    this.jogKeys = new JogKeys(this.commander, page.toggle);
+    this.jogKeys = new JogKeys(this.commander, page.toggle, (part) => this.choosePart(part));
     this.limits = new LimitsList(this.commander, marks);
     new PoseList(this.commander, (text) => this.notice(text));
     this.setUpControls();
@@ -165,6 +165,13 @@ export class Steering {
       this.show();
     });
     holdButton(element("steer-go"), (isHeld) => commander.setGo(isHeld));
+    for (const part of ["arm", "base"] as const) {
+      element(`steer-part-${part}`).addEventListener("click", () => this.choosePart(part));
+    }
+    element("steer-stow").addEventListener("click", () => {
+      commander.stow();
+      this.show();
+    });
     element("steer-place").addEventListener("click", () => this.choosePlace(!this.floorGoal.isChoosing));
     element("steer-discard").addEventListener("click", () => {
       commander.interrupt("the goal was discarded");
@@ -205,7 +212,7 @@ export class Steering {
     this.commander.receive(message, performance.now());
     if (message.type === "arm") {
       this.notice("");
-      element("steer").dataset.robot = message.base ? "base" : "arm";
+      this.showPart();
     }
     if (message.type === "state" || message.type === "preview") this.draw();
     if (message.type === "state" || message.type === "arm") this.stopButton.show();
@@ -216,6 +223,30 @@ export class Steering {
     this.floorGoal.isChoosing = isChoosing;
     element("steer-place").ariaPressed = String(isChoosing);
     this.show();
+  }
+
+  private choosePart(part: Part): void {
+    this.choosePlace(false);
+    this.commander.choosePart(part);
+    this.gizmo.giveUp();
+    this.show();
+    announce(`You move the ${part}`);
+  }
+
+  /** Shows the controls of the chosen part. */
+  private showPart(): void {
+    const { part, hasBothParts, arm } = this.commander;
+    const panel = element("steer");
+    if (panel.dataset.robot !== part) {
+      panel.dataset.robot = part;
+      this.gizmo.place(null);
+      this.ghost.hide();
+    }
+    element("steer-parts").hidden = !hasBothParts;
+    for (const shown of ["arm", "base"] as const) element(`steer-part-${shown}`).ariaPressed = String(part === shown);
+    element("steer-stow").hidden = arm?.base?.stowed == null || !hasBothParts;
+    setText(element("steer-avoidance"), arm?.base ? avoidanceText(arm.base.avoidance) : "");
+    element("steer-avoidance").dataset.avoidance = arm?.base?.avoidance ?? "";
   }
 
   private closed(): void {
@@ -256,7 +287,9 @@ export class Steering {
     this.padIx = pad?.ix ?? null;
     commander.setPad(pad?.input ?? null, hasAttention);
     const unknown = pads.some((other) => other !== null) ? "The gamepad has an unknown layout and is not used" : "";
-    setText(element("steer-pad"), pad ? "Gamepad: hold a trigger, move the sticks" : unknown);
+    const both = this.commander.hasBothParts ? ". Y switches between arm and base" : "";
+    const padText = `Gamepad: hold a trigger, move the sticks${both}`;
+    setText(element("steer-pad"), pad ? padText : unknown);
   }
 
   private notice(text: string): void {
@@ -300,15 +333,13 @@ export class Steering {
   }
 
   private draw(): void {
-    if (this.commander.arm?.base) {
-      this.drawFloorGoal();
-      // Places of a base are in the world.
-      this.limits.show(ORIGIN);
-      return;
+    if (this.commander.arm?.base) this.drawFloorGoal();
+    if (this.commander.arm?.joints.length) {
+      this.placeGizmo();
+      this.drawGhost();
     }
-    this.placeGizmo();
-    this.drawGhost();
-    this.limits.show(this.worldFromBase);
+    // Places of a base are in the world.
+    this.limits.show({ arm: this.worldFromBase, base: ORIGIN });
   }
 
   private drawFloorGoal(): void {
@@ -357,7 +388,8 @@ export class Steering {
     this.jogKeys.show();
     if (!element("steer").hidden) this.jogPad.show();
     this.showMode();
-    if (this.commander.arm?.base) this.showBaseGoal();
+    this.showPart();
+    if (this.commander.part === "base") this.showBaseGoal();
     else this.showGoal();
     this.showTime();
     const contacts = commander.state?.contacts ?? 0;
@@ -373,14 +405,15 @@ export class Steering {
   }
 
   private showMode(): void {
-    const { arm, mode, roundTrips, previewsAlways, hasControl } = this.commander;
+    const { arm, mode, part, roundTrips, previewsAlways, hasControl } = this.commander;
     const millis = roundTrips.millis(performance.now());
     const ofArm = arm ? modeText(mode, millis, arm.servo_round_trip_millis, previewsAlways) : "";
-    const text = arm?.base ? baseText(millis) : ofArm;
+    const text = part === "base" ? baseText(millis) : ofArm;
     setText(element("steer-mode"), text);
     element("steer-mode").dataset.mode = mode;
-    if (hasControl && mode !== this.shownMode) announce(text.split(" (")[0]!);
-    this.shownMode = hasControl ? mode : "";
+    const shown = `${part} ${mode}`;
+    if (hasControl && shown !== this.shownMode) announce(text.split(" (")[0]!);
+    this.shownMode = hasControl ? shown : "";
   }
 
   private showGoal(): void {

@@ -4,9 +4,10 @@ import { type action, isTyping } from "../keys";
 import { announce } from "../panels/announcer";
 import { element } from "../panels/element";
 import { setText } from "../panels/html";
+import { capitalized } from "../panels/sentence";
 import { disable, setTitle } from "../panels/title";
 import type { Commander } from "./commander";
-import { stopText } from "./texts";
+import { robotName, stopText } from "./texts";
 import { TwoPresses } from "./two_presses";
 
 const REARM = "Permit motion";
@@ -43,13 +44,19 @@ export class StopButton {
     // Without a link, the arm brakes by its own watchdog; a button that does nothing must not look as if it did.
     disable(this.button, canSend ? "" : "The link to the arm is cut: the arm brakes when its commands expire");
     const isOwn = state?.holder === arm?.client;
-    setText(element("steer-who"), typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "");
+    const who = typeof state?.holder === "number" ? (isOwn ? "you" : `operator ${state.holder}`) : "";
+    setText(element("steer-who"), who !== "" && state?.moved_part ? `${who}: ${state.moved_part}` : who);
     this.showStop(state ? stopText(state) : "");
-    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : state?.base ? "Base stopped" : "Arm stopped");
+    setText(element("steer-halt"), state?.is_recovering ? "Arm is being recovered" : `${capitalized(this.robot)} stopped`);
     this.shownStop = state?.stop_number ?? null;
     const reason = state?.is_recovering ? "The arm is being recovered: wait" : "";
     disable(this.rearm, hasControl ? reason : "Only the operator who has control can permit motion");
     setText(this.rearm, this.presses.isAwaited(this.shownStop) ? REARM_AGAIN : REARM);
+  }
+
+  private get robot(): string {
+    const { arm } = this.commander;
+    return robotName(arm === null || arm.joints.length > 0, arm?.base != null);
   }
 
   private showStop(text: string): void {

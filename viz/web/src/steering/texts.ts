@@ -1,23 +1,42 @@
 // What the panel says about control, the link, limits and goals. This file has no DOM.
 
-import type { Limit, SteerState, Verdict } from "./messages";
+import type { Avoidance, Limit, SteerState, Verdict } from "./messages";
 import type { Mode } from "./round_trip";
 
 /** Who has control, from the view of one client. `robot` names the steered part of the robot. */
-export function leaseText({ holder, lease_left_secs, offered_to }: SteerState, client: number, robot = "arm"): string {
+export function leaseText({ holder, lease_left_secs, offered_to, moved_part }: SteerState, client: number, robot = "arm"): string {
   if (holder === null) return `Nobody has control of the ${robot}`;
   if (holder === client) {
     return offered_to === null ? "You have control" : `You have control, offered to operator ${offered_to}`;
   }
   // The time begins anew with each message of the holder.
   const left = lease_left_secs === null ? "" : ` for at least ${Math.max(0, lease_left_secs).toFixed(0)} s more`;
-  const who = `Operator ${holder} has control${left}`;
+  const what = moved_part === null ? "" : ` and moves the ${moved_part}`;
+  const who = `Operator ${holder} has control${what}${left}`;
   return offered_to === client ? `${who}. Control is offered to you` : who;
 }
 
+/** The steered parts of a robot in one word. */
+export function robotName(hasArm: boolean, hasBase: boolean): string {
+  if (hasArm && hasBase) return "robot";
+  return hasBase ? "base" : "arm";
+}
+
+/** What keeps a base away from obstacles, in one sentence. */
+export function avoidanceText(avoidance: Avoidance): string {
+  switch (avoidance) {
+    case "unknown_space":
+      return "The base stops before everything that is not known to be free";
+    case "seen_surfaces":
+      return "The base stops before surfaces that were seen. It enters space that nothing has seen: look where it drives";
+    case "nothing":
+      return "Nothing but you keeps the base away from obstacles";
+  }
+}
+
 /** Why the arm is stopped, and that it is being recovered; empty if neither is so. */
-export function stopText({ stop, is_recovering, base }: SteerState): string {
-  const reason = stop === null ? "" : `The ${base ? "base" : "arm"} is stopped: ${stop}`;
+export function stopText({ stop, is_recovering, base, position }: SteerState): string {
+  const reason = stop === null ? "" : `The ${robotName(position.length > 0, base !== null)} is stopped: ${stop}`;
   if (!is_recovering) return reason;
   return `The arm is being recovered. Motion is permitted afterward, unless somebody stops it. ${reason}`.trimEnd();
 }

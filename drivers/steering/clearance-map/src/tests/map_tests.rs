@@ -212,6 +212,7 @@ fn map_follows_a_moving_base_with_bounded_memory() {
             stamp: image.stamp,
             capsules,
             world_from_base,
+            heights_m: None,
         });
         // The table is below the base, wherever it is and however it is turned.
         let seen = tested.reading([0.0, 0.0, 0.2], image.stamp).unwrap();
@@ -234,6 +235,7 @@ fn map_follows_a_moving_base_with_bounded_memory() {
         stamp: at(101.0),
         capsules: Vec::new(),
         world_from_base: after,
+        heights_m: None,
     });
     let seen = tested.reading([-0.3, 0.0, 0.2], at(101.0)).unwrap();
     assert!(seen.distance_m > 0.1 && seen.age_secs >= 1.0, "{seen:?}");

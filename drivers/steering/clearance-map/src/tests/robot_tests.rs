@@ -5,7 +5,7 @@ use super::scene::{
 };
 use crate::capsules::in_grid;
 use crate::image::Posture;
-use crate::rows::{BUNDLE, Rows};
+use crate::rows::{BUNDLE, Obstacles, Rows};
 use kinematics::Transform;
 use nalgebra::Vector3;
 use numbers::random::Random;
@@ -189,7 +189,7 @@ fn moving_robot_leaves_no_trace_in_the_rows() {
         &mut random,
     ));
     let snapshot = tested.map.snapshot();
-    let mut moved = Rows::new(&snapshot);
+    let mut moved = Rows::new(&snapshot, Obstacles::NotFree);
     for _ in 0..20 {
         let capsules: Vec<Capsule> = (0..5)
             .map(|_| Capsule {
@@ -202,7 +202,7 @@ fn moving_robot_leaves_no_trace_in_the_rows() {
             .collect();
         let robot = in_grid(&capsules, &Transform::identity(), &snapshot.grid, 0.0);
         moved.set_robot(&robot);
-        let mut fresh = Rows::new(&snapshot);
+        let mut fresh = Rows::new(&snapshot, Obstacles::NotFree);
         fresh.set_robot(&robot);
         assert!(moved.blocked() == fresh.blocked() && moved.bundles() == fresh.bundles());
         // Bundles are the union of their rows, also where the robot has cleared some.

@@ -3,6 +3,7 @@
 use crate::config::MapConfig;
 use crate::image::{DepthImage, DepthOrigin, Posture};
 use crate::query::{Query, Robot};
+use crate::rows::Obstacles;
 use crate::voxel_map::VoxelMap;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -182,7 +183,7 @@ pub(super) struct Tested {
 impl Tested {
     pub(super) fn new(config: &MapConfig) -> Self {
         let map = VoxelMap::new(config).unwrap();
-        let query = Query::new(config, Arc::new(map.snapshot()));
+        let query = Query::new(config, Arc::new(map.snapshot()), Obstacles::NotFree);
         Self { map, query }
     }
 
@@ -205,6 +206,7 @@ impl Tested {
             stamp,
             capsules: capsules.to_vec(),
             world_from_base: Transform::identity(),
+            heights_m: None,
         });
     }
 

@@ -1,12 +1,12 @@
 //! Whether the arm could rest at a posture, for previews of goals.
 
-use super::{Restriction, Steering, refused};
+use super::ArmChain;
 use crate::capsule::Capsule;
-use crate::clearance::Clearance;
-use crate::reason::{Limit, Link};
+use crate::clearance::{Clearance, Restriction};
+use crate::reason::{Limit, Link, refused};
 use kinematics::Stamp;
 
-impl Steering {
+impl ArmChain {
     /// Checks a posture with the links that depend on it: limits, self-collision and clearance. It
     /// changes nothing, and says nothing about the way to the posture.
     ///
@@ -15,7 +15,12 @@ impl Steering {
     ///
     /// # Errors
     /// The first limit that would refuse the posture.
-    pub fn check_posture(&self, now: Stamp, q: &[f64], scene: &dyn Clearance) -> Result<(), Limit> {
+    pub(crate) fn check_posture(
+        &self,
+        now: Stamp,
+        q: &[f64],
+        scene: &dyn Clearance,
+    ) -> Result<(), Limit> {
         if let Some(reason) = self.limits.outside(&self.chain, q) {
             return Err(refused(Link::Limits, reason));
         }
