@@ -1,9 +1,10 @@
-//! Steers an arm without a run.
+//! Steers an arm or a base without a run.
 
+use super::base::PreparedBase;
 use super::surroundings::Surroundings;
 use super::{PreparedSteering, SteeringThread, robot};
 use capture::config::Rig;
-use capture::open::SteeredArm;
+use capture::open::{SteeredArm, SteeredBase};
 use drivers::motion::SteeringPort;
 use std::sync::Arc;
 use viz::Hub;
@@ -28,4 +29,15 @@ pub fn steer_standalone<S: Surroundings>(
     let robot = robot::chain_and_body(rig)?;
     let prepared = PreparedSteering::of(SteeredArm::holding(port), rig, robot, scene);
     prepared.start(hub, None)
+}
+
+/// Lets clients of the hub drive a base, like [`steer_standalone`].
+///
+/// * `rig`: the settings of the base.
+///
+/// # Errors
+///
+/// If the configuration is not valid, or no thread can be started.
+pub fn drive_standalone(rig: &Rig, base: SteeredBase, hub: &Hub) -> anyhow::Result<SteeringThread> {
+    PreparedBase::new(base, rig).start(hub, None)
 }
