@@ -139,7 +139,9 @@ pub use session::{
 };
 pub use session_setup::{NewObserver, Services};
 pub use started_run::StartedRun;
-pub use steering::{SteeringThread, Surroundings, steer_standalone, steering_log};
+pub use steering::{
+    SteeringThread, Surroundings, drive_standalone, steer_standalone, steering_log,
+};
 pub use stored_keyframes::StoredKeyframes;
 pub use train_plan::{TrainOutcome, TrainPlan, Trained};
 pub use training::{UnsavedTraining, check_before_data, limits, model_specs};

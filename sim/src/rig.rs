@@ -25,6 +25,7 @@ use kinematics::{Chain, Stamp, Transform};
 use mujoco_rs::prelude::MjModel;
 use nalgebra::Point3;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 
 /// The simulated arm as a URDF, with the same kinematics and limits. The base is `panda_link0`, and
 /// the flange is `panda_link8`.
@@ -307,6 +308,27 @@ impl Rig {
     /// time zero has the stamp 0.
     pub fn into_commanded(self, limits: &[MotionLimits]) -> Result<CommandedRig, Error> {
         CommandedRig::new(self.engine, self.info, limits)
+    }
+
+    /// Like [`Self::into_commanded`], and counts how often a part of the robot touches a part of the
+    /// scene.
+    ///
+    /// # Errors
+    ///
+    /// If the arm cannot be commanded, or the model of the contacts cannot be built.
+    pub fn into_counted(
+        self,
+        limits: &[MotionLimits],
+    ) -> Result<(CommandedRig, Arc<AtomicU64>), Error> {
+        let Self {
+            mut engine,
+            info,
+            build_contacts,
+        } = self;
+        let counter = ContactCounter::new(build_contacts()?);
+        let n_contacts = counter.n_contacts();
+        engine.count_contacts(Some(counter));
+        Ok((CommandedRig::new(engine, info, limits)?, n_contacts))
     }
 
     /// The joint positions that the arm reports at the start, in the order of the joint readings.

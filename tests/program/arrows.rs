@@ -33,8 +33,8 @@ const ALLOWED: &str = "
                      kinematics messages model-files numbers report steering trainer viz
     calibrate     -> calibration capture drivers files keyframe kinematics messages numbers report \
                      session targets viz
-    bench         -> calibration capture drivers files gpu keyframe kinematics messages model-files \
-                     numbers report session steering trainer viz
+    bench         -> calibration capture clearance-map drivers files gpu keyframe kinematics \
+                     messages model-files numbers report session steering trainer viz
     fieldrig      -> background bench calibrate calibration capture drivers files gpu keyframe \
                      kinematics messages session sim targets trainer viz
 ";

@@ -2,6 +2,7 @@
 //! of a few tiny photos.
 
 use crate::command::assert_one_error;
+use crate::small_rig::{self, Pace};
 use image::RgbImage;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -148,6 +149,66 @@ fn steering_bench_reports_each_fault_and_writes_a_chart() {
 
     let unknown = ["steering", "--faults", "weather"];
     assert_fails_with(folder.path(), &unknown, 2, &["--faults", "weather"]);
+}
+
+#[test]
+fn steering_bench_kills_the_program_that_drives_a_base() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args = ["steering", "--arms", "udp-base", "--trials", "1", "--json"];
+    let rest = [
+        "--faults",
+        "released,program-killed",
+        "--poses",
+        "0",
+        "--grips",
+        "0",
+    ];
+    let events = events(folder.path(), &[&args[..], &rest].concat());
+    let [released, killed, _] = &events[..] else {
+        panic!("two faults and the results: {events:?}");
+    };
+    assert_eq!(released["row"]["n_exceeded"], 0, "{released}");
+    let row = &killed["row"];
+    assert_eq!(row["fault"], "program-killed", "{killed}");
+    // On a busy computer, the base may never have moved.
+    if row["n_trials"] == 1 {
+        assert_eq!(
+            row["n_not_at_rest"], 0,
+            "its controller stops the base: {killed}"
+        );
+        // The limits of braking predict nothing, because the program cannot brake.
+        assert!(row["predicted"]["worst_millis"].is_null(), "{killed}");
+    }
+}
+
+#[test]
+fn steering_bench_steers_a_run_to_views_that_its_scan_never_had() {
+    let folder = tempfile::tempdir().expect("a folder");
+    small_rig::write(folder.path(), Pace::RealTime);
+    let views = ["steering", "--views", "2", "--views-rig", "rig.toml"];
+    let slow = ["--views-round-trip", "150", "--trials", "0", "--json"];
+    let rest = ["--tracking-seconds", "0", "--poses", "0", "--grips", "0"];
+    let events = events(folder.path(), &[&views[..], &slow, &rest].concat());
+    let views = events[0]["findings"]["views"].as_array().expect("a list");
+    assert_eq!(views.len(), 2, "{events:?}");
+    for view in views {
+        assert_eq!(
+            view["is_previewed"], true,
+            "150 ms are too long to follow a hand: {view}"
+        );
+    }
+    let arrived: Vec<_> = views
+        .iter()
+        .filter(|view| view["arrived_secs"].is_f64())
+        .collect();
+    assert!(!arrived.is_empty(), "{views:?}");
+    // How much better the picture is after 20 s depends on the computer.
+    for view in arrived {
+        let db = |name: &str| view[name].as_f64();
+        if let [Some(before), Some(after)] = [db("before_db"), db("after_db")] {
+            assert!(after > before, "{view}");
+        }
+    }
 }
 
 /// Checks that `--scan` reproduces the counts of a scan (docs/benchmarks/README.md), with as many

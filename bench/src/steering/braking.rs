@@ -18,8 +18,18 @@ pub(super) struct Braking {
     /// From here on, the arm is at rest.
     pub(super) rests_secs: f64,
     /// When the arm would be at rest if it braked with its limits from the beginning of the brake
-    /// on.
-    pub(super) predicted_secs: f64,
+    /// on; `None` if other rules count.
+    pub(super) predicted_secs: Option<f64>,
+}
+
+impl Braking {
+    /// A brake by other rules than the limits.
+    pub(super) fn without_prediction(self) -> Self {
+        Self {
+            predicted_secs: None,
+            ..self
+        }
+    }
 }
 
 /// Why there is no brake to measure.
@@ -67,7 +77,7 @@ pub(super) fn braking(
     Ok(Braking {
         begins_secs: begins_at.secs_since(event_at),
         rests_secs: rest.at.secs_since(event_at),
-        predicted_secs: predicted_at.secs_since(event_at),
+        predicted_secs: Some(predicted_at.secs_since(event_at)),
     })
 }
 
@@ -93,6 +103,9 @@ fn stop_secs_of(sample: &Sample, brake_limits: &[MotionLimits]) -> f64 {
 /// * `motion`: velocity and acceleration.
 pub(super) fn stop_secs(motion: [f64; 2], max_acceleration: f64, max_jerk: f64) -> f64 {
     let [velocity, acceleration] = motion;
+    if max_jerk.is_infinite() {
+        return velocity.abs() / max_acceleration;
+    }
     // The velocity that is left if the acceleration is first reduced to zero. Its sign is the
     // direction in which the joint must brake.
     let coasting = velocity + acceleration * acceleration.abs() / (2.0 * max_jerk);
@@ -138,7 +151,8 @@ mod tests {
             "{braking:?}"
         );
         assert!(
-            (braking.rests_secs - braking.predicted_secs).abs() < 2.0 * TWO_CYCLES_SECS,
+            (braking.rests_secs - braking.predicted_secs.expect("predicted")).abs()
+                < 2.0 * TWO_CYCLES_SECS,
             "{braking:?}"
         );
     }
@@ -149,7 +163,7 @@ mod tests {
         let event_at = after_cycles(N_MOVING - 1);
         let harder = brake_limits(&limits(), 2.0);
         let braking = braking(&samples, event_at, None, &harder).expect("it brakes");
-        let late_secs = braking.rests_secs - braking.predicted_secs;
+        let late_secs = braking.rests_secs - braking.predicted_secs.expect("predicted");
         assert!(late_secs > 0.1, "{braking:?}");
     }
 

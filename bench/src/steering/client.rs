@@ -25,6 +25,8 @@ struct Received {
     state: Option<Value>,
     /// The newest answer to a ping.
     pong: Option<Value>,
+    /// The newest preview.
+    preview: Option<Value>,
     /// Why requests were refused.
     refusals: Vec<String>,
     /// Times from the sample of a device to the setpoint, milliseconds, by number of the sample.
@@ -192,6 +194,33 @@ impl SteeringClient {
         client_state(self.shared.received.lock().state.as_ref()?)
     }
 
+    /// The newest state with all its fields; `None` before the first one.
+    pub(super) fn raw_state(&self) -> Option<Value> {
+        self.shared.received.lock().state.clone()
+    }
+
+    /// Greatest round trip at which the arm follows without a preview.
+    pub(super) fn servo_round_trip(&self) -> Duration {
+        let received = self.shared.received.lock();
+        let arm = received.arm.as_ref();
+        let millis = arm.and_then(|arm| arm["servo_round_trip_millis"].as_f64());
+        Duration::from_secs_f64(1e-3 * millis.unwrap_or_default().max(0.0))
+    }
+
+    /// Waits for the answer to a preview.
+    ///
+    /// # Errors
+    ///
+    /// If there is none within a minute.
+    pub(super) fn wait_for_preview(&self, id: u64) -> Result<Value> {
+        self.wait("an answer to a preview", |received| {
+            received
+                .preview
+                .clone()
+                .filter(|preview| preview["id"] == id)
+        })
+    }
+
     /// Waits for a state.
     ///
     /// # Errors
@@ -331,6 +360,7 @@ impl Reader {
         match message["type"].as_str() {
             Some("arm") => received.arm = Some(message),
             Some("pong") => received.pong = Some(message),
+            Some("preview") => received.preview = Some(message),
             Some("refused") => {
                 let text = message["text"].as_str().unwrap_or_default().to_owned();
                 received.refusals.push(text);

@@ -1,8 +1,9 @@
 //! The faults that an arm must survive, and how the client of an operator causes them.
 
+use super::arms::ArmKind;
 use super::client::{ClockError, SteeringClient};
 use super::link::LinkFault;
-use super::operator::{Operator, hand_at};
+use super::operator::{Hand, Operator, hand_at};
 use anyhow::Result;
 use nalgebra::Vector3;
 use serde::Serialize;
@@ -79,6 +80,10 @@ pub enum Fault {
     Loss5,
     /// The link loses one packet in seven.
     Loss15,
+    /// The program that moves the robot is stopped by a signal.
+    ProgramStopped,
+    /// The program that moves the robot is killed.
+    ProgramKilled,
 }
 
 /// Reason for which the arm brakes.
@@ -115,7 +120,7 @@ impl Serialize for Fault {
 
 impl Fault {
     /// All faults, in the order of the tables.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 26] = [
         Self::Released,
         Self::PageHidden,
         Self::PageClosed,
@@ -140,6 +145,8 @@ impl Fault {
         Self::FarGoal,
         Self::Loss5,
         Self::Loss15,
+        Self::ProgramStopped,
+        Self::ProgramKilled,
     ];
 
     /// The name of the fault for flags.
@@ -152,6 +159,24 @@ impl Fault {
     #[must_use]
     pub fn title(self) -> &'static str {
         self.entry().title
+    }
+
+    /// Whether the fault can happen to a robot. A base has no map of free space yet, and follows
+    /// velocities, neither hands nor poses of a tip.
+    #[must_use]
+    pub fn concerns(self, kind: ArmKind) -> bool {
+        let is_of_arms = matches!(
+            self,
+            Self::DecisionsHeld | Self::ClearanceMissing | Self::HandJumps | Self::FarGoal
+        );
+        let has_own_rules = !self.ends_program() || kind.is_device();
+        has_own_rules && !(is_of_arms && kind.is_base())
+    }
+
+    /// Whether the program ends, so that only the device can brake.
+    #[must_use]
+    pub fn ends_program(self) -> bool {
+        matches!(self, Self::ProgramStopped | Self::ProgramKilled)
     }
 
     /// Maximum time from the event to the beginning of the brake, milliseconds.
@@ -271,6 +296,18 @@ impl Fault {
                 SILENCE,
                 Event::Release,
             ),
+            Self::ProgramStopped => entry(
+                "program-stopped",
+                "program stopped (SIGSTOP)",
+                SILENCE,
+                Event::Fault,
+            ),
+            Self::ProgramKilled => entry(
+                "program-killed",
+                "program killed (SIGKILL)",
+                SILENCE,
+                Event::Fault,
+            ),
         }
     }
 
@@ -321,7 +358,9 @@ impl Fault {
             | Self::Reordered
             | Self::NotFinite
             | Self::HandJumps
-            | Self::FarGoal => {}
+            | Self::FarGoal
+            | Self::ProgramStopped
+            | Self::ProgramKilled => {}
         }
         Ok(())
     }
@@ -364,7 +403,8 @@ impl FaultyDevice {
 
     /// Sends the message of the fault instead of a sample of the hand. The connection may
     /// have ended.
-    pub(super) fn send(&mut self, operator: &mut Operator<'_>, hand_m: Vector3<f64>) -> Result<()> {
+    pub(super) fn send(&mut self, operator: &mut Operator<'_>, hand: &Hand) -> Result<()> {
+        let intent = operator.intent(hand);
         match self.fault {
             Fault::PageClosed | Fault::PageCrashed | Fault::PageFrozen => Ok(()),
             Fault::Released => {
@@ -377,12 +417,12 @@ impl FaultyDevice {
                 None => Ok(()),
             },
             Fault::Duplicated => {
-                let sample = operator.closed_sample(&hand_at(hand_m));
+                let sample = operator.closed_sample(&intent);
                 operator.client.send(&sample)?;
                 operator.client.send(&sample)
             }
             Fault::Reordered => {
-                let sample = operator.closed_sample(&hand_at(hand_m));
+                let sample = operator.closed_sample(&intent);
                 match self.held_back.take() {
                     Some(held_back) => {
                         operator.client.send(&sample)?;
@@ -395,18 +435,23 @@ impl FaultyDevice {
                 }
             }
             Fault::NotFinite => {
-                let sample = operator.closed_sample(&hand_at(Vector3::zeros()));
+                let sample = operator.closed_sample(&operator.intent(&Hand::AT_REST));
                 // JSON has no number that is not finite, so this one is too large.
-                let text = sample.to_string().replacen("[0.0,", "[1e999,", 1);
+                let text = sample.to_string();
+                let text = if operator.rig.robot.kind.is_base() {
+                    text.replacen("\"yaw_rad_s\":0.0", "\"yaw_rad_s\":1e999", 1)
+                } else {
+                    text.replacen("[0.0,", "[1e999,", 1)
+                };
                 operator.client.send_text(&text)
             }
             Fault::HandJumps => {
-                let jumped_m = hand_m + Vector3::new(0.0, 0.0, JUMP_M);
+                let jumped_m = hand.at_m + Vector3::new(0.0, 0.0, JUMP_M);
                 let sample = operator.closed_sample(&hand_at(jumped_m));
                 operator.client.send(&sample)
             }
             Fault::FarGoal => {
-                let direction = hand_m.try_normalize(0.0).unwrap_or_else(Vector3::x);
+                let direction = hand.at_m.try_normalize(0.0).unwrap_or_else(Vector3::x);
                 let [x, y, z]: [f64; 3] = (direction * FAR_M).into();
                 let intent =
                     json!({ "kind": "pose", "base_from_tip": [x, y, z, 1.0, 0.0, 0.0, 0.0] });
@@ -414,7 +459,7 @@ impl FaultyDevice {
                 operator.client.send(&sample)
             }
             _ => {
-                let sample = operator.closed_sample(&hand_at(hand_m));
+                let sample = operator.closed_sample(&intent);
                 operator.client.send(&sample)
             }
         }

@@ -3,7 +3,7 @@
 //!
 //! A grip concerns the decisions and the generator of setpoints alone, so the clock is simulated.
 
-use super::trace::{Excess, Sample, largest_excess};
+use super::trace::{Excess, Period, Sample, largest_excess};
 use anyhow::{Context, Result};
 use capture::known_robots::KnownRobot;
 use drivers::motion::{ArmState, Follower, MotionLimits, brake_limits};
@@ -72,7 +72,7 @@ pub(super) fn measure(n_grips: u32) -> Result<Grips> {
     for grip in 1..=u64::from(n_grips) {
         let start = arm.follower.setpoint().position.clone();
         let samples = arm.grip(grip, &mut random)?;
-        let excess = largest_excess(&samples, &arm.brake_limits, PERIOD.as_secs_f64());
+        let excess = largest_excess(&samples, &arm.brake_limits, Period::Constant(PERIOD));
         grips.n_exceeded += u32::from(excess.is_some());
         grips.excess = grips.excess.or(excess);
         grips.n_moved += u32::from(arm.follower.setpoint().position != start);

@@ -30,6 +30,8 @@ pub(super) struct LinkFault {
     pub(super) is_cut: bool,
     /// Fraction of the packets that are lost, 0 to 1.
     pub(super) loss_frac: f64,
+    /// Time that every packet takes, in both directions.
+    pub(super) delay: Duration,
 }
 
 /// A link to a server. Dropping it ends the connection.
@@ -141,8 +143,10 @@ impl Direction {
     }
 
     fn arrival(&mut self) -> Instant {
-        let loss_frac = self.fault.lock().loss_frac;
-        let mut at = Instant::now();
+        let LinkFault {
+            loss_frac, delay, ..
+        } = *self.fault.lock();
+        let mut at = Instant::now() + delay;
         if self.random.unit() < loss_frac {
             at += FAST_RETRANSMIT;
             if self.random.unit() < loss_frac {
@@ -213,6 +217,22 @@ mod tests {
         stream.set_read_timeout(None).expect("no timeout");
         stream.read_exact(&mut reply).expect("a reply");
         assert_eq!(&reply, b"cd");
+    }
+
+    #[test]
+    fn a_slow_link_delivers_after_its_delay_in_each_direction() {
+        const DELAY: Duration = Duration::from_millis(20);
+        let link = to_echo();
+        link.set(LinkFault {
+            delay: DELAY,
+            ..LinkFault::default()
+        });
+        let mut stream = link.stream().try_clone().expect("a connection");
+        let began = Instant::now();
+        stream.write_all(b"ab").expect("sent");
+        let mut reply = [0; 2];
+        stream.read_exact(&mut reply).expect("a reply");
+        assert!(began.elapsed() >= 2 * DELAY && &reply == b"ab");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The fault matrix: how fast an arm brakes after each fault, over many trials.
 
 use super::arms::ArmKind;
+use super::braking::Braking;
 use super::faults::Fault;
 use super::operator::Operator;
 use super::rig::SteeredRig;
@@ -17,9 +18,13 @@ use serde::Serialize;
 const MAX_REPEATS: u32 = 3;
 /// The way that every fault of the matrix takes.
 const PATH: &str = "client, server, decisions and arm in real time";
+/// The way of faults that end the program.
+const PATH_OF_PROCESSES: &str = "client, another process with server, decisions and driver, device";
 /// Rounding to cycles by which an arm may be at rest later than predicted, milliseconds: the
 /// beginning and the end of a brake, and the delay of a setpoint on its way to a controller.
 const MAX_LATE_MILLIS: f64 = 5.0;
+/// The same in cycles of a robot whose cycles are longer.
+const N_LATE_CYCLES: f64 = 2.25;
 
 /// Results of all trials of a fault with an arm.
 #[derive(Clone, Debug, Serialize)]
@@ -99,11 +104,12 @@ pub(super) fn measure(rig: &SteeredRig, fault: Fault, n_trials: u32) -> Result<F
             None => n_repeated += 1,
         }
     }
-    Ok(FaultRow::of(rig.arm.kind, fault, n_repeated, &outcomes))
+    Ok(FaultRow::of(rig.robot.kind, fault, n_repeated, &outcomes))
 }
 
 impl FaultRow {
-    fn of(arm: ArmKind, fault: Fault, n_repeated: u32, outcomes: &[Outcome]) -> Self {
+    /// * `n_repeated`: trials in which the robot stopped before the event.
+    pub(super) fn of(arm: ArmKind, fault: Fault, n_repeated: u32, outcomes: &[Outcome]) -> Self {
         let brakes = || outcomes.iter().filter_map(|outcome| outcome.braking);
         let count = |is_counted: &dyn Fn(&Outcome) -> bool| {
             outcomes
@@ -111,7 +117,8 @@ impl FaultRow {
                 .map(|outcome| u32::from(is_counted(outcome)))
                 .sum()
         };
-        let late = Spread::of(brakes().map(|brake| brake.rests_secs - brake.predicted_secs));
+        let late_secs = |brake: Braking| Some(brake.rests_secs - brake.predicted_secs?);
+        let late = Spread::of(brakes().filter_map(late_secs));
         Self {
             arm,
             fault,
@@ -121,7 +128,7 @@ impl FaultRow {
             begins: Spread::of(brakes().map(|brake| brake.begins_secs)),
             goal_millis: fault.goal_millis(),
             rests: Spread::of(brakes().map(|brake| brake.rests_secs)),
-            predicted: Spread::of(brakes().map(|brake| brake.predicted_secs)),
+            predicted: Spread::of(brakes().filter_map(|brake| brake.predicted_secs)),
             late_millis: late.worst_millis,
             n_not_at_rest: count(&|outcome| outcome.braking.is_none()),
             n_exceeded: count(&|outcome| outcome.excess.is_some()),
@@ -146,7 +153,8 @@ impl FaultRow {
         if is_late {
             problems.push(format!("brakes after more than {} ms", self.goal_millis));
         }
-        if self.late_millis.is_some_and(|late| late > MAX_LATE_MILLIS) {
+        let max_late_millis = MAX_LATE_MILLIS.max(N_LATE_CYCLES * self.arm.cycle_millis());
+        if self.late_millis.is_some_and(|late| late > max_late_millis) {
             problems.push("at rest later than predicted".to_owned());
         }
         for (n, what) in [
@@ -165,7 +173,12 @@ impl FaultRow {
         let mut cells = vec![
             self.arm.name().to_owned(),
             self.title.to_owned(),
-            PATH.to_owned(),
+            if self.fault.ends_program() {
+                PATH_OF_PROCESSES
+            } else {
+                PATH
+            }
+            .to_owned(),
             self.n_trials.to_string(),
         ];
         cells.extend(self.begins.cells());
@@ -173,7 +186,12 @@ impl FaultRow {
         cells.extend(self.rests.cells());
         cells.extend(self.predicted.cells());
         cells.push(cell(self.late_millis));
-        cells.push(self.n_exceeded.to_string());
+        cells.push(if self.fault.ends_program() {
+            // The device brakes by its own rules.
+            "-".to_owned()
+        } else {
+            self.n_exceeded.to_string()
+        });
         cells.push(self.n_own_brakes.to_string());
         cells.push(self.n_repeated.to_string());
         let problems = self.problems();
@@ -193,7 +211,7 @@ fn cell(millis: Option<f64>) -> String {
 /// The table of all faults.
 pub(super) fn table(rows: &[FaultRow]) -> Table {
     let head = [
-        "arm",
+        "robot",
         "fault",
         "path",
         "trials",
@@ -285,7 +303,7 @@ mod tests {
             braking: Some(Braking {
                 begins_secs,
                 rests_secs,
-                predicted_secs: begins_secs + 0.2,
+                predicted_secs: Some(begins_secs + 0.2),
             }),
             excess: None,
             stopped: None,

@@ -10,6 +10,8 @@ mod arms;
 mod braking;
 mod client;
 mod faults;
+#[cfg(feature = "sim")]
+mod goals;
 mod grips;
 mod inverse;
 mod link;
@@ -17,17 +19,25 @@ mod matrix;
 mod operator;
 mod rig;
 mod scene;
+#[cfg(all(feature = "sim", target_os = "linux"))]
+mod stopped_program;
 mod trace;
 mod tracking;
 mod trial;
+mod views;
 
 pub use arms::ArmKind;
 pub use faults::Fault;
+#[cfg(feature = "sim")]
+pub use goals::{GoalKind, GoalRow, GoalScene};
 pub use grips::Grips;
 pub use inverse::InverseRates;
 pub use matrix::{FaultRow, Spread};
+#[cfg(all(feature = "sim", target_os = "linux"))]
+pub use stopped_program::serve_robot;
 pub use trace::{Excess, LimitKind};
 pub use tracking::Tracking;
+pub use views::{ViewOptions, ViewRow};
 
 use crate::findings::{BenchResult, Findings};
 use anyhow::{Context, Result};
@@ -38,11 +48,11 @@ use std::path::PathBuf;
 /// Options of [`run`]. A part with the size 0 is left out.
 #[derive(Clone, Debug)]
 pub struct SteeringOptions {
-    /// The arms.
+    /// The arms and bases.
     pub arms: Vec<ArmKind>,
-    /// The faults.
+    /// The faults. Each robot gets those that concern it.
     pub faults: Vec<Fault>,
-    /// Trials of each fault with each arm.
+    /// Trials of each fault with each robot.
     pub n_trials: u32,
     /// Duration of the figure of eight with each arm, seconds.
     pub tracking_secs: f64,
@@ -50,6 +60,12 @@ pub struct SteeringOptions {
     pub n_poses: u32,
     /// Grips with the hand anywhere.
     pub n_grips: u32,
+    /// Goals of each kind in each simulated scene.
+    pub n_goals: u32,
+    /// Views that the scan never had; `None` leaves them out.
+    pub views: Option<ViewOptions>,
+    /// The program that is stopped and killed: this one. `None` leaves these faults out.
+    pub program: Option<PathBuf>,
     /// Folder for charts and numbers.
     pub out: PathBuf,
 }
@@ -61,6 +77,9 @@ struct Results {
     tracking: Vec<Tracking>,
     inverse: Vec<InverseRates>,
     grips: Option<Grips>,
+    #[cfg(feature = "sim")]
+    goals: Vec<GoalRow>,
+    views: Vec<ViewRow>,
 }
 
 /// Measures, and writes the files after each part.
@@ -83,27 +102,44 @@ pub fn run(
     if options.n_grips > 0 {
         results.grips = Some(grips::measure(options.n_grips)?);
     }
+    if options.n_goals > 0 {
+        measure_goals(options, &mut results)?;
+    }
+    if let Some(views) = &options.views {
+        let program = options.program.as_deref();
+        let program = program.context("the program that is steered is not known")?;
+        results.views = views::measure(views, program, &options.out.join("run"))?;
+    }
     for arm in &options.arms {
-        let is_used = options.tracking_secs > 0.0 || options.n_trials > 0;
-        if !is_used {
-            break;
+        let is_tracked = options.tracking_secs > 0.0 && !arm.is_base();
+        if !is_tracked && options.n_trials == 0 {
+            continue;
         }
-        log::info!("steering the arm {:?}", arm.name());
+        log::info!("steering {:?}", arm.name());
         let rig = SteeredRig::start(arms::start(*arm)?)?;
-        if options.tracking_secs > 0.0 {
+        if is_tracked {
             let tracking = tracking::measure(&rig, options.tracking_secs)?;
             results.tracking.push(tracking);
         }
         if options.n_trials == 0 {
             continue;
         }
-        for fault in &options.faults {
+        for fault in options.faults.iter().filter(|fault| fault.concerns(*arm)) {
+            if fault.ends_program() {
+                continue;
+            }
             let row = matrix::measure(&rig, *fault, options.n_trials)?;
             on_row(&row)?;
             results.faults.push(row);
             // An interrupted bench keeps its results.
             findings(options, &results)?.write(&options.out)?;
         }
+    }
+    for (arm, fault) in faults_of_programs(options) {
+        let row = end_program(options, arm, fault)?;
+        on_row(&row)?;
+        results.faults.push(row);
+        findings(options, &results)?.write(&options.out)?;
     }
     let findings = findings(options, &results)?;
     let page = findings.write(&options.out)?;
@@ -112,6 +148,56 @@ pub fn run(
         page,
         data_losses: Vec::new(),
     })
+}
+
+/// The faults that end the program, with the devices that they concern.
+fn faults_of_programs(options: &SteeringOptions) -> Vec<(ArmKind, Fault)> {
+    if options.n_trials == 0 || options.program.is_none() {
+        return Vec::new();
+    }
+    let faults = options.faults.iter().filter(|fault| fault.ends_program());
+    let of_fault = |fault: &Fault| {
+        let arms = options.arms.iter().filter(|arm| fault.concerns(**arm));
+        arms.map(|arm| (*arm, *fault)).collect::<Vec<_>>()
+    };
+    faults.flat_map(of_fault).collect()
+}
+
+#[cfg(all(feature = "sim", target_os = "linux"))]
+fn end_program(options: &SteeringOptions, arm: ArmKind, fault: Fault) -> Result<FaultRow> {
+    let program = options.program.as_deref();
+    let program = program.context("the program that is stopped is not known")?;
+    log::info!("{}: {}", arm.name(), fault.title());
+    stopped_program::measure(arm, fault, options.n_trials, program)
+}
+
+#[cfg(not(all(feature = "sim", target_os = "linux")))]
+fn end_program(_options: &SteeringOptions, arm: ArmKind, _fault: Fault) -> Result<FaultRow> {
+    anyhow::bail!("{:?} is not part of this program", arm.name())
+}
+
+/// Tries goals in all scenes.
+#[cfg(feature = "sim")]
+fn measure_goals(options: &SteeringOptions, results: &mut Results) -> Result<()> {
+    for scene in GoalScene::ALL {
+        log::info!("goals: {}", scene.title());
+        results
+            .goals
+            .extend(goals::measure(scene, options.n_goals)?);
+        // An interrupted bench keeps its results.
+        findings(options, results)?.write(&options.out)?;
+    }
+    Ok(())
+}
+
+#[cfg(not(feature = "sim"))]
+fn measure_goals(_options: &SteeringOptions, _results: &mut Results) -> Result<()> {
+    Err(messages::BadInput(
+        "goals in simulated scenes need a program with the simulator: build it with \
+         `cargo build --release --features sim`"
+            .to_owned(),
+    )
+    .into())
 }
 
 fn findings(options: &SteeringOptions, results: &Results) -> Result<Findings> {
@@ -130,16 +216,25 @@ fn findings(options: &SteeringOptions, results: &Results) -> Result<Findings> {
     if let Some(grips) = &results.grips {
         tables.push(grips::table(grips));
     }
+    #[cfg(feature = "sim")]
+    if !results.goals.is_empty() {
+        tables.push(goals::table(&results.goals));
+    }
+    if !results.views.is_empty() {
+        tables.push(views::table(&results.views));
+    }
     let faults = format!(
-        "Each fault happens {} times while the tip follows a hand at 0.1 m/s. Times are from the \
+        "Each fault happens {} times while the tip follows a hand at 0.1 m/s, or a base drives at \
+         0.25 m/s. Times are from the \
          fault, or from the release of the switch while the fault lasts. A brake begins with the \
-         first cycle from which the arm only becomes slower, and not before the arm reports the end \
-         of its motion. The prediction follows from the limits of braking. The position, velocity, \
-         acceleration and jerk of each joint are checked in each cycle.",
+         first cycle from which the robot only becomes slower, and not before it reports the end of \
+         its motion. The prediction follows from the limits of braking. The position, velocity, \
+         acceleration and jerk of each joint, or the velocities and accelerations of a base, are \
+         checked in each cycle.",
         options.n_trials
     );
     let path = "Faults take the way of a run in real time: a client of /steer on a real connection, \
-                the server, the thread of the decisions, and the thread of the arm. Loss is the \
+                the server, the thread of the decisions, and the thread of the robot. Loss is the \
                 delay with which TCP delivers a lost packet. Grips are measured on a simulated \
                 clock, without a server.";
     Ok(Findings {

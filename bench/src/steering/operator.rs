@@ -1,5 +1,6 @@
-//! An operator whose hand moves the arm through a client of `/steer`, as a page does.
+//! An operator who moves the arm or base through a client of `/steer`, as a page does.
 
+use super::arms::{ArmKind, Moved};
 use super::client::SteeringClient;
 use super::rig::SteeredRig;
 use anyhow::{Context, Result, bail};
@@ -30,6 +31,7 @@ pub(super) struct Operator<'rig> {
     pub(super) client: SteeringClient,
     /// Number of the newest grip.
     grip: u64,
+    /// First position of the tip; zero for a base, which may be anywhere.
     home_m: Vector3<f64>,
     next_sample_at: Instant,
 }
@@ -41,13 +43,15 @@ impl<'rig> Operator<'rig> {
     ///
     /// If the server does not accept the client.
     pub(super) fn connect(rig: &'rig SteeredRig) -> Result<Self> {
-        let arm = &rig.arm;
-        let home = arm.chain.forward(&arm.start)?;
+        let home_m = match &rig.robot.moved {
+            Moved::Arm(arm) => arm.chain.forward(&arm.start)?.translation.vector,
+            Moved::Base(_) => Vector3::zeros(),
+        };
         Ok(Self {
             rig,
             client: rig.connect()?,
             grip: 0,
-            home_m: home.translation.vector,
+            home_m,
             next_sample_at: Instant::now(),
         })
     }
@@ -73,16 +77,26 @@ impl<'rig> Operator<'rig> {
         Ok(self.tip_m()? - self.home_m)
     }
 
-    /// Position of the tip, meters.
+    /// Position of the tip, meters; zero for a base.
     pub(super) fn tip_m(&self) -> Result<Vector3<f64>> {
-        let pose = self.rig.arm.chain.forward(&self.arm()?.position)?;
-        Ok(pose.translation.vector)
+        match &self.rig.robot.moved {
+            Moved::Arm(arm) => {
+                let pose = arm.chain.forward(&self.arm()?.position)?;
+                Ok(pose.translation.vector)
+            }
+            Moved::Base(_) => Ok(Vector3::zeros()),
+        }
+    }
+
+    /// The intent that moves the arm as the hand moves, or the base with its velocity.
+    pub(super) fn intent(&self, hand: &Hand) -> Value {
+        intent_of(self.rig.robot.kind, hand)
     }
 
     /// The newest state that the arm's thread reported.
     pub(super) fn arm(&self) -> Result<ArmState> {
-        let state = self.rig.arm.port.state();
-        state.context("the arm has reported no state")
+        let state = self.rig.robot.state();
+        state.context("the robot has reported no state")
     }
 
     /// Waits until the next sample is due.
@@ -130,7 +144,8 @@ impl<'rig> Operator<'rig> {
         self.grip += 1;
         for _ in 0..N_STILL_SAMPLES {
             self.wait_for_sample();
-            let sample = self.closed_sample(&hand_at(Vector3::zeros()));
+            let intent = self.intent(&Hand::AT_REST);
+            let sample = self.closed_sample(&intent);
             self.client.send(&sample)?;
         }
         Ok(())
@@ -188,7 +203,7 @@ impl<'rig> Operator<'rig> {
     /// Moves the arm to its first posture.
     fn return_home(&mut self) -> Result<()> {
         let until = Instant::now() + MAX_WAIT;
-        let home = self.rig.arm.start.clone();
+        let home = self.rig.robot.arm()?.start.clone();
         let intent = json!({ "kind": "joints", "position": home });
         self.begin_grip()?;
         loop {
@@ -221,6 +236,40 @@ impl<'rig> Operator<'rig> {
         let open = self.open_sample();
         self.client.send(&open)
     }
+}
+
+/// The hand of an operator.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Hand {
+    /// Where it is, relative to the start of its grip.
+    pub(super) at_m: Vector3<f64>,
+    pub(super) velocity_m_s: Vector3<f64>,
+}
+
+impl Hand {
+    pub(super) const AT_REST: Self = Self {
+        at_m: Vector3::new(0.0, 0.0, 0.0),
+        velocity_m_s: Vector3::new(0.0, 0.0, 0.0),
+    };
+}
+
+/// The intent that moves an arm as the hand moves, or a base with its velocity.
+pub(super) fn intent_of(kind: ArmKind, hand: &Hand) -> Value {
+    if kind.is_base() {
+        velocity_of_base(hand.velocity_m_s)
+    } else {
+        hand_at(hand.at_m)
+    }
+}
+
+/// The intent to move the base at a velocity, forward and left.
+fn velocity_of_base(velocity_m_s: Vector3<f64>) -> Value {
+    json!({
+        "kind": "base_velocity",
+        "forward_m_s": velocity_m_s.x,
+        "left_m_s": velocity_m_s.y,
+        "yaw_rad_s": 0.0,
+    })
 }
 
 /// The intent to move the tip as the hand, which is at a position.

@@ -12,6 +12,9 @@ fn one_trial_of_each_fault_brakes_the_arm_within_its_limits() {
         tracking_secs: 2.0,
         n_poses: 0,
         n_grips: 0,
+        n_goals: 0,
+        views: None,
+        program: None,
         out: folder.path().to_owned(),
     };
     let mut rows = Vec::new();
@@ -20,7 +23,9 @@ fn one_trial_of_each_fault_brakes_the_arm_within_its_limits() {
         Ok(())
     })
     .expect("the arm is steered");
-    assert_eq!(rows.len(), Fault::ALL.len());
+    // Without a program, nothing is stopped or killed.
+    let n_faults = Fault::ALL.iter().filter(|fault| !fault.ends_program());
+    assert_eq!(rows.len(), n_faults.count());
     for row in &rows {
         // On a busy computer, no trial may come to its fault.
         if row.n_trials == 0 {

@@ -5,6 +5,7 @@ use kinematics::Stamp;
 use parking_lot::Mutex;
 use serde::Serialize;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// Rounding of differences between cycles, relative to a limit. A generator sets velocities of up
 /// to 1e-8 to zero at the end of a trajectory, which looks like jerk.
@@ -51,6 +52,16 @@ impl Recorder {
     }
 }
 
+/// Time between two setpoints.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Period {
+    /// Always the same. The stamps show when a busy computer generated the setpoints, not when they
+    /// are due.
+    Constant(Duration),
+    /// The difference of their stamps, for which they were computed.
+    Stamps,
+}
+
 /// Limits of a joint in each cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -82,12 +93,11 @@ pub struct Excess {
 /// cycles; `None` if every limit is kept.
 ///
 /// * `limits`: of each joint.
-/// * `period_secs`: time between two cycles. The stamps are not used, because a busy computer
-///   delays them.
+/// * `period`: time between two cycles.
 pub(super) fn largest_excess(
     samples: &[Sample],
     limits: &[MotionLimits],
-    period_secs: f64,
+    period: Period,
 ) -> Option<Excess> {
     let mut largest: Option<(f64, Excess)> = None;
     let mut note = |kind, joint_ix, value: f64, limit: f64, ratio: f64| {
@@ -105,6 +115,10 @@ pub(super) fn largest_excess(
     };
     for pair in samples.windows(2) {
         let [before, after] = [&pair[0].setpoint, &pair[1].setpoint];
+        let period_secs = match period {
+            Period::Constant(period) => period.as_secs_f64(),
+            Period::Stamps => pair[1].at.secs_since(pair[0].at),
+        };
         for (ix, joint) in limits.iter().enumerate() {
             let position = after.position[ix];
             let [lower, upper] = joint.position;
@@ -144,6 +158,7 @@ pub(super) mod tests {
     use std::time::Duration;
 
     pub(in super::super) const PERIOD: Duration = Duration::from_millis(1);
+    const CONSTANT: Period = Period::Constant(PERIOD);
     const PERIOD_NANOS: i64 = 1_000_000;
 
     pub(in super::super) fn limits() -> Vec<MotionLimits> {
@@ -195,7 +210,7 @@ pub(super) mod tests {
     #[test]
     fn a_motion_within_its_limits_has_no_excess() {
         let samples = braked_motion(1000, &limits());
-        assert_eq!(largest_excess(&samples, &limits(), 1e-3), None);
+        assert_eq!(largest_excess(&samples, &limits(), CONSTANT), None);
     }
 
     #[test]
@@ -218,12 +233,13 @@ pub(super) mod tests {
             LimitKind::Acceleration,
             LimitKind::Jerk,
         ] {
-            let excess = largest_excess(&samples, &narrower(kind), 1e-3).expect("it is exceeded");
+            let excess =
+                largest_excess(&samples, &narrower(kind), CONSTANT).expect("it is exceeded");
             assert_eq!((excess.kind, excess.joint_ix), (kind, 0), "{excess:?}");
         }
         let mut jump = samples.clone();
         jump[500].setpoint.position[1] = f64::NAN;
-        let excess = largest_excess(&jump, &limits(), 1e-3).expect("not a number");
+        let excess = largest_excess(&jump, &limits(), CONSTANT).expect("not a number");
         assert_eq!(excess.joint_ix, 1, "{excess:?}");
     }
 

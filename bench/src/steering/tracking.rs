@@ -77,7 +77,7 @@ pub(super) fn measure(rig: &SteeredRig, planned_seconds: f64) -> Result<Tracking
     let tip_at_start_m = operator.tip_m()?;
     operator.begin_grip()?;
     let braked_before = operator.arm()?.braked_motion;
-    rig.arm.recorder.take();
+    rig.robot.recorder.take();
     let began_at = clock::now();
     let mut record = Record::default();
     let mut secs = 0.0;
@@ -86,7 +86,7 @@ pub(super) fn measure(rig: &SteeredRig, planned_seconds: f64) -> Result<Tracking
         secs = clock::now().secs_since(began_at);
         let sample = operator.closed_sample(&hand_at(figure.at(secs)));
         operator.client.send(&sample)?;
-        record.add(&rig.arm.recorder.take(), rig, began_at)?;
+        record.add(&rig.robot.recorder.take(), rig, began_at)?;
     }
     let open = operator.open_sample();
     operator.client.send(&open)?;
@@ -99,7 +99,7 @@ pub(super) fn measure(rig: &SteeredRig, planned_seconds: f64) -> Result<Tracking
     let mut errors_mm = errors_mm(&figure, &tips, COMPARED_LAG_SECS);
     let lag_secs = best_lag_secs(&figure, &tips);
     Ok(Tracking {
-        arm: rig.arm.kind,
+        arm: rig.robot.kind,
         seconds: secs,
         planned_seconds,
         p50_error_mm: median(&errors_mm),
@@ -114,7 +114,7 @@ pub(super) fn measure(rig: &SteeredRig, planned_seconds: f64) -> Result<Tracking
         }),
         applied_p50_millis: median(&applied_millis),
         applied_p99_millis: quantile(&mut applied_millis, 0.99, Rank::Lower),
-        success_frac: rig.arm.running.success_frac(),
+        success_frac: rig.robot.running.success_frac(),
         excess: record.excess,
     })
 }
@@ -128,9 +128,9 @@ struct Record {
 
 impl Record {
     fn add(&mut self, samples: &[Sample], rig: &SteeredRig, began_at: Stamp) -> Result<()> {
-        let arm = &rig.arm;
-        let period_secs = arm.period.as_secs_f64();
-        let excess = largest_excess(samples, &arm.checked_limits, period_secs);
+        let robot = &rig.robot;
+        let arm = robot.arm()?;
+        let excess = largest_excess(samples, &robot.checked_limits, robot.period);
         self.excess = self.excess.or(excess);
         for sample in samples {
             let secs = sample.at.secs_since(began_at);

@@ -1,9 +1,10 @@
 //! One trial: an operator moves the arm, a fault happens, and the arm comes to rest.
 
+use super::arms::Moved;
 use super::braking::{Braking, braking};
 use super::client::SteeringClient;
 use super::faults::{Event, Fault, FaultyDevice};
-use super::operator::{Operator, hand_at};
+use super::operator::{Hand, Operator};
 use super::trace::{Excess, largest_excess};
 use anyhow::Result;
 use drivers::clock;
@@ -15,6 +16,8 @@ use std::time::{Duration, Instant};
 
 /// Speed of the hand, m/s.
 const HAND_M_S: f64 = 0.1;
+/// Speed of a base, m/s.
+const BASE_M_S: f64 = 0.25;
 /// Speed of the joints above which the arm moves, rad/s. At the speed of the hand, it is two to
 /// three times as fast.
 const MOVING_RAD_S: f64 = 0.05;
@@ -80,9 +83,13 @@ pub(super) fn run(
     random: &mut Random,
 ) -> Result<Option<Outcome>> {
     operator.prepare()?;
-    let hand_m_s = HAND_M_S * direction(operator.offset_from_home_m()?, random);
+    let hand_m_s = match operator.rig.robot.moved {
+        Moved::Arm(_) => HAND_M_S * direction(operator.offset_from_home_m()?, random),
+        Moved::Base(_) if random.unit() < 0.5 => BASE_M_S * Vector3::x(),
+        Moved::Base(_) => -BASE_M_S * Vector3::x(),
+    };
     let moving_secs = random.uniform(MOVING_SECS[0], MOVING_SECS[1]);
-    operator.rig.arm.recorder.take();
+    operator.rig.robot.recorder.take();
     let mut trial = Trial {
         operator,
         other,
@@ -146,14 +153,17 @@ impl Trial<'_, '_> {
         Ok(())
     }
 
-    /// Where the hand is now, relative to the start of its grip.
-    fn hand_m(&self) -> Vector3<f64> {
-        self.hand_m_s * self.grip_began.elapsed().as_secs_f64()
+    /// The hand now.
+    fn hand(&self) -> Hand {
+        Hand {
+            at_m: self.hand_m_s * self.grip_began.elapsed().as_secs_f64(),
+            velocity_m_s: self.hand_m_s,
+        }
     }
 
     /// Whether the arm follows the grip.
     fn is_following(&self) -> Result<bool> {
-        let newest = self.operator.rig.arm.recorder.newest();
+        let newest = self.operator.rig.robot.recorder.newest();
         let is_moving = newest.is_some_and(|sample| sample.speed() > MOVING_RAD_S);
         Ok(is_moving && !self.has_braked()?)
     }
@@ -170,7 +180,8 @@ impl Trial<'_, '_> {
         let mut following_since = None;
         while Instant::now() < until && !self.has_braked()? {
             self.operator.wait_for_sample();
-            let sample = self.operator.closed_sample(&hand_at(self.hand_m()));
+            let intent = self.operator.intent(&self.hand());
+            let sample = self.operator.closed_sample(&intent);
             self.operator.client.send(&sample)?;
             self.last_sample = Some(sample);
             if self.is_following()? {
@@ -191,7 +202,8 @@ impl Trial<'_, '_> {
         let until = Instant::now() + FAULT_TIME;
         while Instant::now() < until {
             self.operator.wait_for_sample();
-            device.send(self.operator, self.hand_m())?;
+            let hand = self.hand();
+            device.send(self.operator, &hand)?;
             if self.has_braked()? {
                 self.n_own_brakes += 1;
                 self.operator.wait_for_rest()?;
@@ -211,7 +223,8 @@ impl Trial<'_, '_> {
         let mut rests_since = None;
         while began.elapsed() < MAX_BRAKE {
             if self.operator.is_sample_due() && !self.operator.client.is_closed() {
-                let sent = device.send(self.operator, self.hand_m());
+                let hand = self.hand();
+                let sent = device.send(self.operator, &hand);
                 if let Err(error) = sent {
                     // The server may end the connection because of the fault.
                     log::debug!("the connection of the operator ended: {error:#}");
@@ -242,13 +255,12 @@ impl Trial<'_, '_> {
         ended_at: Option<Stamp>,
         stopped: Option<String>,
     ) -> Outcome {
-        let arm = &self.operator.rig.arm;
-        let samples = arm.recorder.take();
-        let period_secs = arm.period.as_secs_f64();
-        let braking = braking(&samples, event_at, ended_at, arm.port.brake_limits());
+        let robot = &self.operator.rig.robot;
+        let samples = robot.recorder.take();
+        let braking = braking(&samples, event_at, ended_at, &robot.brake_limits);
         Outcome {
             braking: braking.ok(),
-            excess: largest_excess(&samples, &arm.checked_limits, period_secs),
+            excess: largest_excess(&samples, &robot.checked_limits, robot.period),
             stopped,
             n_own_brakes: self.n_own_brakes,
         }

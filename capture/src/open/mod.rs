@@ -2,6 +2,8 @@
 
 mod arm_config;
 mod assumed_lens;
+#[cfg(feature = "sim")]
+mod counted;
 #[cfg(all(test, feature = "sim"))]
 mod documented_rigs_tests;
 #[cfg(all(feature = "sim", target_os = "linux"))]
@@ -32,6 +34,8 @@ mod ur;
 
 #[cfg(target_os = "linux")]
 pub use arm_config::controller_chain;
+#[cfg(feature = "sim")]
+pub use counted::{CountedArm, counted};
 pub(crate) use listening::{DeviceFailure, Listening, for_listening};
 pub use meshes_to_record::meshes_to_record;
 pub use movable::{Movable, movable};

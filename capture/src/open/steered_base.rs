@@ -36,6 +36,12 @@ impl SteeredBase {
         }
     }
 
+    /// A base that another program has opened, whose pose nothing reports.
+    #[must_use]
+    pub fn driven_by(drive: BaseDrive) -> Self {
+        Self::standing(drive, RobotTap::default())
+    }
+
     /// Targets and states of the base.
     #[must_use]
     pub fn port(&self) -> &BasePort {

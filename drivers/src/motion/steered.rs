@@ -64,6 +64,7 @@ impl Steered {
         self.obey(now);
         let setpoint = self.follower.step(now)?;
         self.position.clone_from(&setpoint.position);
+        self.port.note_setpoint(now, &setpoint);
         self.report(now, None);
         Ok(setpoint)
     }

@@ -4,16 +4,20 @@
 //! the other.
 
 use super::follower::{Follower, brake_limits};
+use super::generator::Setpoint;
 use super::target::{ArmState, NotFollowed, Output, Target, TargetOrder};
 use super::{MotionLimits, motion_error};
 use crate::Error;
 use kinematics::Stamp;
 use parking_lot::Mutex;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 /// Enables a stopped arm again, see [`MovableArm::recover`](super::MovableArm::recover).
 type Recover = Box<dyn Fn() -> Result<(), Error> + Send + Sync>;
+
+/// Receives each setpoint, see [`SteeringPort::observe_setpoints`].
+type SetpointObserver = Box<dyn Fn(Stamp, &Setpoint) + Send + Sync>;
 
 /// Steers an arm from any thread. Clones refer to the same arm.
 ///
@@ -28,6 +32,7 @@ struct Shared {
     brake_factor: f64,
     exchange: Mutex<Exchange>,
     recover: Recover,
+    observer: OnceLock<SetpointObserver>,
 }
 
 #[derive(Default)]
@@ -77,6 +82,7 @@ impl SteeringPort {
             brake_factor,
             exchange: Mutex::new(Exchange::default()),
             recover: Box::new(recover),
+            observer: OnceLock::new(),
         })))
     }
 
@@ -121,6 +127,20 @@ impl SteeringPort {
     /// If the arm cannot be enabled, or does not exist any more.
     pub fn recover(&self) -> Result<(), Error> {
         (self.0.recover)()
+    }
+
+    /// Calls `observer` with each setpoint of a motion, in the thread of the arm. It must return
+    /// quickly. Only the first observer of a port counts.
+    pub fn observe_setpoints(&self, observer: impl Fn(Stamp, &Setpoint) + Send + Sync + 'static) {
+        // A second observer is dropped.
+        let _ = self.0.observer.set(Box::new(observer));
+    }
+
+    /// Passes a setpoint to the observer, if there is one.
+    pub(super) fn note_setpoint(&self, now: Stamp, setpoint: &Setpoint) {
+        if let Some(observer) = self.0.observer.get() {
+            observer(now, setpoint);
+        }
     }
 
     /// Acceleration and jerk of braking, as a factor of the limits of motions.

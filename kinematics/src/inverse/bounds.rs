@@ -75,12 +75,22 @@ impl Bounds {
         let [lower, upper] = self.ranges[joint_ix];
         let mut turned = value;
         if self.is_periodic[joint_ix] {
-            turned += TAU * ((reference - value) / TAU).round();
+            // Most values need no turn, and rounding takes longer than the comparison.
+            if (reference - value).abs() > PI {
+                turned += TAU * ((reference - value) / TAU).round();
+            }
             // If the reference is near an end of the range, the closest value may be beyond this
-            // end.
+            // end. Most of these values have no turn within the range, which is found without
+            // rounding.
             if turned > upper + ROUNDING_RAD {
+                if turned - TAU < lower - ROUNDING_RAD {
+                    return None;
+                }
                 turned -= TAU * ((turned - upper - ROUNDING_RAD) / TAU).ceil();
             } else if turned < lower - ROUNDING_RAD {
+                if turned + TAU > upper + ROUNDING_RAD {
+                    return None;
+                }
                 turned += TAU * ((lower - ROUNDING_RAD - turned) / TAU).ceil();
             }
         }

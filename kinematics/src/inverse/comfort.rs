@@ -60,7 +60,11 @@ fn zone_depth([lower, upper]: [f64; 2], value: f64) -> f64 {
     if !(zone > 0.0 && zone.is_finite()) {
         return 0.0;
     }
-    let above = (value - (upper - zone)) / zone;
-    let below = (lower + zone - value) / zone;
-    above.max(0.0) - below.max(0.0)
+    let above = (value - (upper - zone)).max(0.0);
+    let below = (lower + zone - value).max(0.0);
+    // Most values are outside of the zones, and need no division.
+    if above == 0.0 && below == 0.0 {
+        return 0.0;
+    }
+    (above - below) / zone
 }

@@ -12,7 +12,7 @@
 //! the chain.
 
 use crate::{Chain, Transform};
-use nalgebra::{Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 /// Largest distance between the axes of a chain and the axes of a Franka arm, meters and radians.
 /// Calibrated arms deviate by about a millimeter. Least squares correct the remaining error of the
@@ -33,17 +33,17 @@ const MIN_SINE: f64 = 1e-6;
 #[derive(Clone, Debug)]
 pub struct FrankaArm {
     shoulder_from_base: Transform,
-    /// Pose of the tip in the frame of joint 7. The origin of this frame is the point on the axis
-    /// of joint 7 that is closest to the axis of joint 6. If joint 7 is at 0, its x axis points
-    /// away from the axis of joint 6.
-    seven_from_tip: Transform,
+    /// Pose of the frame of joint 7 in the frame of the tip. The origin of this frame is the point
+    /// on the axis of joint 7 that is closest to the axis of joint 6. If joint 7 is at 0, its x
+    /// axis points away from the axis of joint 6.
+    tip_from_seven: Transform,
     lengths: Lengths,
-    /// Lengths of upper arm and forearm. They follow from `lengths`, and are stored because each
-    /// test of the search needs them.
+    /// Lengths of upper arm and forearm. This field and the next two follow from `lengths`. They are
+    /// stored, because each test of the search needs them.
     segments_m: [f64; 2],
-    /// Value of joint 4 at which the forearm lies along the upper arm. It is stored for the same
-    /// reason.
+    /// Value of joint 4 at which the forearm lies along the upper arm, and its sine and cosine.
     folded_q4: f64,
+    folded_sin_cos: [f64; 2],
 }
 
 /// Lengths in meters, in the posture with all joints at 0.
@@ -127,12 +127,15 @@ impl FrankaArm {
         let lengths = Lengths::measure(&in_shoulder)?;
         let base_from_tip = chain.forward(&[0.0; 7]).ok()?;
         let shoulder_from_seven = lengths.shoulder_from_seven();
+        let base_from_seven = base_from_shoulder * shoulder_from_seven;
+        let folded_q4 = lengths.folded_q4();
         let arm = Self {
             shoulder_from_base,
-            seven_from_tip: shoulder_from_seven.inverse() * shoulder_from_base * base_from_tip,
+            tip_from_seven: base_from_tip.inverse() * base_from_seven,
             lengths,
             segments_m: lengths.segments(),
-            folded_q4: lengths.folded_q4(),
+            folded_q4,
+            folded_sin_cos: folded_q4.sin_cos().into(),
         };
         let deviates = in_shoulder
             .iter()
@@ -145,33 +148,45 @@ impl FrankaArm {
     /// considered.
     ///
     /// If joint 2 is at 0, joints 1 and 3 have the same axis, and only their sum is determined. In
-    /// this case, joint 1 is set to 0.
+    /// this case, joint 1 is set to 0 or half a turn.
     pub fn solutions(&self, base_from_tip: &Transform, last_rad: f64) -> FrankaSolutions {
         let mut joints_by_branch = [None; 8];
-        if let Some(wrist) = self.wrist(&self.shoulder_from_seven(base_from_tip), last_rad) {
-            for branch in Branch::ALL {
-                joints_by_branch[branch.ix()] = self.joints(&wrist, branch, last_rad);
+        let Some(wrist) = self.wrist(&self.frame_of_seven(base_from_tip), last_rad) else {
+            return FrankaSolutions { joints_by_branch };
+        };
+        for is_elbow_bent in [true, false] {
+            let elbow = self.elbow(&wrist, is_elbow_bent);
+            let Some(bend) = elbow.bend(&wrist) else {
+                continue;
+            };
+            for is_wrist_outward in [true, false] {
+                let q6 = bend.q6(is_wrist_outward);
+                let forearm = elbow.forearm(&wrist, &bend, is_wrist_outward);
+                let q2 = forearm.q2();
+                let [q1, q3] = forearm.q1_and_q3();
+                let other = [opposite(q1), -q2, opposite(q3)];
+                for (is_shoulder_forward, [q1, q2, q3]) in [(true, [q1, q2, q3]), (false, other)] {
+                    let branch = Branch {
+                        is_elbow_bent,
+                        is_wrist_outward,
+                        is_shoulder_forward,
+                    };
+                    let joints = [q1, q2, q3, elbow.q4, forearm.q5, q6, last_rad];
+                    joints_by_branch[branch.ix()] = Some(joints);
+                }
             }
         }
         FrankaSolutions { joints_by_branch }
-    }
-
-    fn joints(&self, wrist: &Wrist, branch: Branch, last_rad: f64) -> Option<[f64; 7]> {
-        let q4 = self.q4(wrist, branch);
-        let elbow = self.elbow(wrist, q4)?;
-        let forearm = elbow.forearm(wrist, branch)?;
-        let [q1, q2, q3] = forearm.shoulder(branch);
-        Some([q1, q2, q3, q4, forearm.q5, forearm.q6, last_rad])
     }
 
     /// The branch of a configuration. `None` if the pose does not belong to the configuration.
     ///
     /// * `base_from_tip`: pose of the tip for these joints.
     pub fn branch(&self, joints: &[f64; 7], base_from_tip: &Transform) -> Option<Branch> {
-        let wrist = self.wrist(&self.shoulder_from_seven(base_from_tip), joints[6])?;
+        let wrist = self.wrist(&self.frame_of_seven(base_from_tip), joints[6])?;
         Some(Branch {
             is_elbow_bent: wrap(joints[3] - self.folded_q4) > 0.0,
-            is_wrist_outward: wrap(joints[5] - wrist.middle_q6) > 0.0,
+            is_wrist_outward: wrap(joints[5] - wrist.middle_q6()) > 0.0,
             is_shoulder_forward: wrap(joints[1]) >= 0.0,
         })
     }
@@ -181,89 +196,114 @@ impl FrankaArm {
         wrap(self.folded_q4 + std::f64::consts::PI)
     }
 
-    /// The pose of the frame of joint 7.
-    pub(super) fn shoulder_from_seven(&self, base_from_tip: &Transform) -> Transform {
-        self.shoulder_from_base * base_from_tip * self.seven_from_tip.inverse()
+    /// The frame of joint 7 of a pose.
+    pub(super) fn frame_of_seven(&self, base_from_tip: &Transform) -> SevenFrame {
+        let pose = self.shoulder_from_base * base_from_tip * self.tip_from_seven;
+        let shoulder_from_seven = pose.rotation.to_rotation_matrix().into_inner();
+        SevenFrame {
+            origin_in_seven: shoulder_from_seven.tr_mul(&pose.translation.vector),
+            shoulder_from_seven,
+        }
     }
 
     /// The wrist for a given last joint. `None` if it is farther from the shoulder than the arm is
     /// long, or too close.
-    pub(super) fn wrist(&self, shoulder_from_seven: &Transform, last_rad: f64) -> Option<Wrist> {
-        let rotation = shoulder_from_seven.rotation;
+    pub(super) fn wrist(&self, seven: &SevenFrame, last_rad: f64) -> Option<Wrist> {
         let (sin, cos) = last_rad.sin_cos();
-        let x_of_six = rotation * Vector3::new(cos, -sin, 0.0);
-        let y_of_six = -(rotation * Vector3::z());
-        let position =
-            shoulder_from_seven.translation.vector - x_of_six * self.lengths.flange_offset;
-        let distance_m = position.norm();
-        let toward_shoulder = -position / distance_m;
-        let along_x = toward_shoulder.dot(&x_of_six);
-        let along_y = toward_shoulder.dot(&y_of_six);
+        // The axes of the frame of joint 6 are (cos, -sin, 0), (0, 0, -1) and (sin, cos, 0) in the
+        // frame of joint 7.
+        let origin = seven.origin_in_seven;
+        let wrist_in_six = Vector3::new(
+            cos * origin.x - sin * origin.y - self.lengths.flange_offset,
+            -origin.z,
+            sin * origin.x + cos * origin.y,
+        );
+        let distance_m = wrist_in_six.norm();
         // Law of cosines for the angle at the elbow.
         let [upper_m, fore_m] = self.segments_m;
         let cosine = (upper_m * upper_m + fore_m * fore_m - distance_m * distance_m)
             / (2.0 * upper_m * fore_m);
         let is_reachable = cosine.abs() <= 1.0 && distance_m > MIN_LENGTH_M;
         is_reachable.then(|| Wrist {
-            x_of_six,
-            y_of_six,
-            toward_shoulder,
+            shoulder_from_seven: seven.shoulder_from_seven,
+            sin_last: sin,
+            cos_last: cos,
+            toward_shoulder: -wrist_in_six / distance_m,
             distance_m,
-            middle_q6: along_x.atan2(along_y),
-            largest_cosine: (along_x * along_x + along_y * along_y).sqrt(),
-            elbow_angle: cosine.acos(),
+            elbow_cosine: cosine,
         })
     }
 
-    /// Joint 4 of a branch.
-    pub(super) fn q4(&self, wrist: &Wrist, branch: Branch) -> f64 {
-        let sign = if branch.is_elbow_bent { 1.0 } else { -1.0 };
-        wrap(self.folded_q4 + sign * wrist.elbow_angle)
-    }
-
-    /// The elbow for a value of joint 4. This value determines the distance of the wrist from the
-    /// shoulder. `None` if the plane of the arm is undetermined.
-    pub(super) fn elbow(&self, wrist: &Wrist, q4: f64) -> Option<Elbow> {
-        let (sin, cos) = q4.sin_cos();
+    /// The elbow of a wrist.
+    pub(super) fn elbow(&self, wrist: &Wrist, is_bent: bool) -> Elbow {
+        let sign = if is_bent { 1.0 } else { -1.0 };
+        let cosine = wrist.elbow_cosine;
+        let sine = sign * (1.0 - cosine * cosine).sqrt();
+        let [folded_sin, folded_cos] = self.folded_sin_cos;
+        let sin_q4 = folded_sin * cosine + folded_cos * sine;
+        let cos_q4 = folded_cos * cosine - folded_sin * sine;
         // This is the position of the wrist in the plane of the arm, in the axes of the upper arm.
         // Joint 4 rotates about -y.
         let [x, z] = self.lengths.wrist_from_elbow;
-        let wrist_x = self.lengths.elbow[0] + x * cos - z * sin;
-        let wrist_z = self.lengths.elbow[1] + z * cos + x * sin;
+        let wrist_x = self.lengths.elbow[0] + x * cos_q4 - z * sin_q4;
+        let wrist_z = self.lengths.elbow[1] + z * cos_q4 + x * sin_q4;
         let toward_shoulder = [-wrist_x / wrist.distance_m, -wrist_z / wrist.distance_m];
-        // The axis of joint 5 has the direction (-sin, cos) in these axes.
-        let cosine = cos * toward_shoulder[1] - sin * toward_shoulder[0];
-        let sine = cos * toward_shoulder[0] + sin * toward_shoulder[1];
-        (sine.abs() > MIN_SINE).then_some(Elbow {
-            sin_q4: sin,
-            cos_q4: cos,
-            cosine,
-            sine,
-        })
+        Elbow {
+            q4: wrap(self.folded_q4 + sign * cosine.acos()),
+            sin_q4,
+            cos_q4,
+            // The axis of joint 5 has the direction (-sin, cos) in these axes.
+            cosine: cos_q4 * toward_shoulder[1] - sin_q4 * toward_shoulder[0],
+            sine: cos_q4 * toward_shoulder[0] + sin_q4 * toward_shoulder[1],
+        }
     }
 }
 
-/// The wrist of a pose, in the frame of the shoulder.
+/// The frame of joint 7 of a pose. Its z axis is the axis of joint 7.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SevenFrame {
+    shoulder_from_seven: Matrix3<f64>,
+    /// From the shoulder to the origin of the frame, in the axes of the frame.
+    origin_in_seven: Vector3<f64>,
+}
+
+/// The wrist of a pose for a value of the last joint.
+///
+/// Directions are in the frame of joint 6, in which most of them are simple: x leads to the axis of
+/// joint 7, y is opposite to this axis, and z is the axis of joint 6.
 pub(super) struct Wrist {
-    /// Axes x and y of the frame of joint 6: x leads to the axis of joint 7, z is the axis of joint
-    /// 6, and y is opposite to the axis of joint 7.
-    x_of_six: Vector3<f64>,
-    y_of_six: Vector3<f64>,
+    shoulder_from_seven: Matrix3<f64>,
+    sin_last: f64,
+    cos_last: f64,
     toward_shoulder: Vector3<f64>,
     /// Distance from the shoulder.
     distance_m: f64,
-    /// Value of joint 6 at which the forearm points most toward the shoulder. It is in the middle
+    /// Cosine of the angle between upper arm and forearm.
+    elbow_cosine: f64,
+}
+
+impl Wrist {
+    /// Angle of joint 6 at which the forearm points most toward the shoulder. It is in the middle
     /// between the two solutions.
-    middle_q6: f64,
-    /// Cosine of the angle between the forearm and the direction toward the shoulder, if joint 6 is
-    /// at `middle_q6`.
-    largest_cosine: f64,
-    /// Angle between upper arm and forearm.
-    elbow_angle: f64,
+    fn middle_q6(&self) -> f64 {
+        self.toward_shoulder.x.atan2(self.toward_shoulder.y)
+    }
+
+    /// Converts a direction from the frame of joint 6 to the frame of the shoulder.
+    fn to_shoulder(&self, in_six: &Vector3<f64>) -> Vector3<f64> {
+        let [sin, cos] = [self.sin_last, self.cos_last];
+        let in_seven = Vector3::new(
+            cos * in_six.x + sin * in_six.z,
+            cos * in_six.z - sin * in_six.x,
+            -in_six.y,
+        );
+        self.shoulder_from_seven * in_seven
+    }
 }
 
 /// An elbow, without its direction in space.
 pub(super) struct Elbow {
+    pub(super) q4: f64,
     sin_q4: f64,
     cos_q4: f64,
     /// Cosine and sine of the angle from the axis of joint 5 to the direction toward the shoulder,
@@ -272,66 +312,121 @@ pub(super) struct Elbow {
     sine: f64,
 }
 
+/// The two values of joint 6 that give the forearm its angle to the shoulder. They are at the same
+/// distance from a value in their middle.
+pub(super) struct Bend {
+    middle_q6: f64,
+    distance_q6: f64,
+    /// Sine and cosine of both.
+    middle: [f64; 2],
+    distance: [f64; 2],
+}
+
+impl Bend {
+    pub(super) fn q6(&self, is_outward: bool) -> f64 {
+        wrap(self.middle_q6 + sign_of(is_outward) * self.distance_q6)
+    }
+
+    fn sin_cos(&self, is_outward: bool) -> [f64; 2] {
+        let [sin, cos] = self.middle;
+        let [distance_sin, distance_cos] = self.distance;
+        let distance_sin = sign_of(is_outward) * distance_sin;
+        [
+            sin * distance_cos + cos * distance_sin,
+            cos * distance_cos - sin * distance_sin,
+        ]
+    }
+}
+
+fn sign_of(is_outward: bool) -> f64 {
+    if is_outward { 1.0 } else { -1.0 }
+}
+
 /// A forearm and an upper arm in space.
 pub(super) struct Forearm {
     pub(super) q5: f64,
-    pub(super) q6: f64,
     /// Axes x and z of the frame of joint 3: z leads along the upper arm, x to the elbow.
     x_of_three: Vector3<f64>,
     z_of_three: Vector3<f64>,
 }
 
 impl Elbow {
-    /// The forearm of a branch. `None` if joint 6 cannot give it the angle to the shoulder.
-    pub(super) fn forearm(&self, wrist: &Wrist, branch: Branch) -> Option<Forearm> {
-        // Joint 6 rotates the axis of joint 5, which is `sin(q6) x + cos(q6) y`. The dot product of
-        // this axis and the direction toward the shoulder must be `cosine`.
-        let ratio = self.cosine / wrist.largest_cosine;
-        let is_possible = ratio.abs() <= 1.0;
-        if !is_possible {
+    /// The values of joint 6. `None` if it cannot give the forearm the angle to the shoulder, or
+    /// if the plane of the arm is undetermined.
+    pub(super) fn bend(&self, wrist: &Wrist) -> Option<Bend> {
+        if self.sine.abs() <= MIN_SINE {
             return None;
         }
-        let sign = if branch.is_wrist_outward { 1.0 } else { -1.0 };
-        let q6 = wrap(wrist.middle_q6 + sign * ratio.acos());
-        let (sin, cos) = q6.sin_cos();
-        let z_of_five = wrist.x_of_six * sin + wrist.y_of_six * cos;
-        let normal = z_of_five.cross(&wrist.toward_shoulder) / self.sine;
-        // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal of
-        // the arm's plane) to the axis of joint 6.
-        let z_of_six = wrist.x_of_six.cross(&wrist.y_of_six);
-        let q5 = (-z_of_six.dot(&z_of_five.cross(&normal))).atan2(-z_of_six.dot(&normal));
-        let z_of_three = z_of_five * self.cos_q4 + normal.cross(&z_of_five) * self.sin_q4;
-        Some(Forearm {
-            q5,
-            q6,
-            x_of_three: normal.cross(&z_of_three),
-            z_of_three,
+        // Joint 6 rotates the axis of joint 5, which is `sin(q6) x + cos(q6) y`. The dot product of
+        // this axis and the direction toward the shoulder must be `cosine`.
+        let [x, y] = [wrist.toward_shoulder.x, wrist.toward_shoulder.y];
+        let largest_cosine = (x * x + y * y).sqrt();
+        let ratio = self.cosine / largest_cosine;
+        let is_possible = ratio.abs() <= 1.0;
+        is_possible.then(|| Bend {
+            middle_q6: wrist.middle_q6(),
+            distance_q6: ratio.acos(),
+            middle: [x / largest_cosine, y / largest_cosine],
+            distance: [(1.0 - ratio * ratio).sqrt(), ratio],
         })
+    }
+
+    /// The forearm for one of the values of joint 6.
+    pub(super) fn forearm(&self, wrist: &Wrist, bend: &Bend, is_outward: bool) -> Forearm {
+        let [sin, cos] = bend.sin_cos(is_outward);
+        let toward = wrist.toward_shoulder / self.sine;
+        let z_of_five = Vector3::new(sin, cos, 0.0);
+        // The normal of the arm's plane is the cross product of the axis of joint 5 and the
+        // direction toward the shoulder.
+        let normal = Vector3::new(
+            cos * toward.z,
+            -sin * toward.z,
+            sin * toward.y - cos * toward.x,
+        );
+        let x_of_five = Vector3::new(-normal.z * cos, normal.z * sin, toward.z);
+        let z_of_three = z_of_five * self.cos_q4 + x_of_five * self.sin_q4;
+        let x_of_three = normal.cross(&z_of_three);
+        Forearm {
+            // Joint 5 rotates about `z_of_five`, from the axis of joint 4 (opposite to the normal
+            // of the arm's plane) to the axis of joint 6.
+            q5: toward.z.atan2(-normal.z),
+            x_of_three: wrist.to_shoulder(&x_of_three),
+            z_of_three: wrist.to_shoulder(&z_of_three),
+        }
     }
 }
 
 impl Forearm {
-    /// Joints 1 to 3 of a branch: `Rz(q1) Ry(q2) Rz(q3)` is the rotation of the upper arm.
-    pub(super) fn shoulder(&self, branch: Branch) -> [f64; 3] {
-        let sign = if branch.is_shoulder_forward {
-            1.0
-        } else {
-            -1.0
-        };
+    /// Joint 2, at least 0. On the other branch, it has the opposite sign.
+    pub(super) fn q2(&self) -> f64 {
+        self.sideways().atan2(self.z_of_three.z)
+    }
+
+    /// Joints 1 and 3 for joint 2 at least 0: `Rz(q1) Ry(q2) Rz(q3)` is the rotation of the upper
+    /// arm.
+    pub(super) fn q1_and_q3(&self) -> [f64; 2] {
         let z = self.z_of_three;
         let x = self.x_of_three;
-        let sideways = (z.x * z.x + z.y * z.y).sqrt();
-        let q1 = if sideways > 0.0 {
-            (sign * z.y).atan2(sign * z.x)
-        } else {
-            0.0
-        };
-        let q2 = (sign * sideways).atan2(z.z);
-        let (sin_q1, cos_q1) = q1.sin_cos();
+        let sideways = self.sideways();
+        if sideways == 0.0 {
+            return [0.0, x.y.atan2(z.z * x.x)];
+        }
+        let [sin_q1, cos_q1] = [z.y / sideways, z.x / sideways];
         let q3 = (cos_q1 * x.y - sin_q1 * x.x)
-            .atan2(z.z * (cos_q1 * x.x + sin_q1 * x.y) - sign * sideways * x.z);
-        [q1, q2, q3]
+            .atan2(z.z * (cos_q1 * x.x + sin_q1 * x.y) - sideways * x.z);
+        [z.y.atan2(z.x), q3]
     }
+
+    /// Sine of joint 2.
+    fn sideways(&self) -> f64 {
+        let z = self.z_of_three;
+        (z.x * z.x + z.y * z.y).sqrt()
+    }
+}
+
+/// Joints 1 and 3 on the other branch of the shoulder are half a turn away.
+pub(super) fn opposite(angle_rad: f64) -> f64 {
+    angle_rad - std::f64::consts::PI.copysign(angle_rad)
 }
 
 impl Lengths {

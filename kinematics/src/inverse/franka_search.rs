@@ -3,8 +3,7 @@
 
 use super::bounds::Bounds;
 use super::comfort::Comfort;
-use super::franka::{Branch, Forearm, FrankaArm, Wrist};
-use crate::Transform;
+use super::franka::{Branch, Forearm, FrankaArm, SevenFrame, opposite};
 
 /// Number of intervals in the range of the last joint at the first level. About 98 % of the
 /// reachable poses of a Panda have a solution at one of their ends.
@@ -13,9 +12,9 @@ const N_INTERVALS: u32 = 14;
 /// values of the last joint are 0.013 rad apart. The few poses without a solution at these values
 /// are left to least squares.
 const N_LEVELS: u32 = 6;
-/// Number of steps of the final search between two tested values. Each step shortens the interval
-/// by the golden ratio. The last interval is 2 % of the first interval.
-const N_GOLDEN_STEPS: usize = 8;
+/// Number of values of the last joint that are tested to refine the best one. The cost is nearly a
+/// parabola there.
+const N_REFINEMENTS: usize = 5;
 
 /// The pose and the preference of a search.
 pub(super) struct FrankaSearch<'a> {
@@ -24,7 +23,7 @@ pub(super) struct FrankaSearch<'a> {
     pub(super) comfort: &'a Comfort,
     /// Configuration from which the squared distance counts as cost.
     pub(super) seed: &'a [f64],
-    pub(super) shoulder_from_seven: Transform,
+    pub(super) seven: SevenFrame,
 }
 
 /// A solution within the ranges.
@@ -93,126 +92,214 @@ impl FrankaSearch<'_> {
 
     /// Compares all solutions for a value of the last joint with the best solution so far.
     fn test(&self, last_rad: f64, best: &mut Option<Candidate>) {
-        let Some(wrist) = self.arm.wrist(&self.shoulder_from_seven, last_rad) else {
+        self.compare(last_rad, &BOTH, best);
+    }
+
+    /// Compares the solutions on some branches with the best solution so far.
+    ///
+    /// Each joint is checked before the next one is computed, because most combinations of joint
+    /// values leave a range, or already cost more than the best solution.
+    fn compare(&self, last_rad: f64, sides: &Sides<'_>, best: &mut Option<Candidate>) {
+        let mut joints = [0.0; 7];
+        let Some(last_cost) = self.place(6, last_rad, &mut joints) else {
             return;
         };
-        // Two consecutive branches have the same elbow and wrist, and differ only in the shoulder.
-        for branches in Branch::ALL.chunks(2) {
-            let most = best.map_or(f64::INFINITY, |best| best.cost);
-            for candidate in self.on_branches(&wrist, last_rad, branches, most) {
-                keep_better(best, candidate);
+        let Some(wrist) = self.arm.wrist(&self.seven, last_rad) else {
+            return;
+        };
+        for is_elbow_bent in sides.elbow.iter().copied() {
+            let elbow = self.arm.elbow(&wrist, is_elbow_bent);
+            let Some(cost) = self.place(3, elbow.q4, &mut joints) else {
+                continue;
+            };
+            let elbow_cost = last_cost + cost;
+            if is_worse(elbow_cost, best.as_ref()) {
+                continue;
+            }
+            let Some(bend) = elbow.bend(&wrist) else {
+                continue;
+            };
+            for is_wrist_outward in sides.wrist.iter().copied() {
+                let Some(cost) = self.place(5, bend.q6(is_wrist_outward), &mut joints) else {
+                    continue;
+                };
+                if is_worse(elbow_cost + cost, best.as_ref()) {
+                    continue;
+                }
+                let forearm = elbow.forearm(&wrist, &bend, is_wrist_outward);
+                let wrist_cost = elbow_cost + cost;
+                let Some(cost) = self.place(4, forearm.q5, &mut joints) else {
+                    continue;
+                };
+                let outer = Outer {
+                    is_elbow_bent,
+                    is_wrist_outward,
+                    joints,
+                    cost: wrist_cost + cost,
+                };
+                if !is_worse(outer.cost, best.as_ref()) {
+                    self.compare_shoulders(&outer, &forearm, sides.shoulder, best);
+                }
             }
         }
     }
 
-    /// The solutions within the ranges on branches that differ at most in the shoulder.
-    ///
-    /// * `most`: cost above which solutions are not needed.
-    fn on_branches(
+    /// Compares the solutions that differ only in the shoulder.
+    fn compare_shoulders(
         &self,
-        wrist: &Wrist,
-        last_rad: f64,
-        branches: &[Branch],
-        most: f64,
-    ) -> impl Iterator<Item = Candidate> {
-        let outer = self.outer_joints(wrist, last_rad, branches[0], most);
-        outer.into_iter().flat_map(move |(forearm, outer, cost)| {
-            branches.iter().filter_map(move |branch| {
-                let mut joints = outer;
-                let mut cost = cost;
-                for (joint_ix, value) in forearm.shoulder(*branch).into_iter().enumerate() {
-                    joints[joint_ix] = self.place(joint_ix, value, &mut cost)?;
-                }
-                Some(Candidate {
-                    branch: *branch,
+        outer: &Outer,
+        forearm: &Forearm,
+        sides: &[bool],
+        best: &mut Option<Candidate>,
+    ) {
+        let forward_q2 = forearm.q2();
+        let mut others = None;
+        for is_shoulder_forward in sides.iter().copied() {
+            let sign = if is_shoulder_forward { 1.0 } else { -1.0 };
+            let mut joints = outer.joints;
+            let Some(added) = self.place(1, sign * forward_q2, &mut joints) else {
+                continue;
+            };
+            let mut cost = outer.cost + added;
+            if is_worse(cost, best.as_ref()) {
+                continue;
+            }
+            let mut values = *others.get_or_insert_with(|| forearm.q1_and_q3());
+            if !is_shoulder_forward {
+                values = values.map(opposite);
+            }
+            let is_within = [0, 2].into_iter().zip(values).all(|(joint_ix, value)| {
+                let added = self.place(joint_ix, value, &mut joints);
+                cost += added.unwrap_or_default();
+                added.is_some()
+            });
+            if is_within && !is_worse(cost, best.as_ref()) {
+                *best = Some(Candidate {
+                    branch: Branch {
+                        is_elbow_bent: outer.is_elbow_bent,
+                        is_wrist_outward: outer.is_wrist_outward,
+                        is_shoulder_forward,
+                    },
                     joints,
                     cost,
-                })
-            })
-        })
-    }
-
-    /// The values of the joints from the elbow to the last joint, and their cost. Each joint is
-    /// checked before the next joint is computed, because most combinations of joint values leave a
-    /// range.
-    fn outer_joints(
-        &self,
-        wrist: &Wrist,
-        last_rad: f64,
-        branch: Branch,
-        most: f64,
-    ) -> Option<(Forearm, [f64; 7], f64)> {
-        let mut joints = [0.0; 7];
-        let mut cost = 0.0;
-        joints[6] = self.place(6, last_rad, &mut cost)?;
-        let q4 = self.arm.q4(wrist, branch);
-        joints[3] = self.place(3, q4, &mut cost)?;
-        if cost > most {
-            return None;
+                });
+            }
         }
-        let elbow = self.arm.elbow(wrist, q4)?;
-        let forearm = elbow.forearm(wrist, branch)?;
-        joints[5] = self.place(5, forearm.q6, &mut cost)?;
-        joints[4] = self.place(4, forearm.q5, &mut cost)?;
-        (cost <= most).then_some((forearm, joints, cost))
     }
 
-    /// Adds the cost of a joint, and returns its value within the range that is closest to the
-    /// seed.
-    fn place(&self, joint_ix: usize, value: f64, cost: &mut f64) -> Option<f64> {
+    /// Sets a joint to its value within the range that is closest to the seed, and returns the cost
+    /// of this value. `None` if no value is within the range.
+    #[inline]
+    fn place(&self, joint_ix: usize, value: f64, joints: &mut [f64; 7]) -> Option<f64> {
         let seed = self.seed[joint_ix];
         let value = self.bounds.nearest_turn(joint_ix, value, seed)?;
-        *cost += (value - seed).powi(2) + self.comfort.cost_of(self.bounds, joint_ix, value);
-        Some(value)
+        joints[joint_ix] = value;
+        let off = value - seed;
+        Some(off * off + self.comfort.cost_of(self.bounds, joint_ix, value))
     }
 
-    /// Moves the last joint on one branch to the least cost between the neighbors of a tested value
-    /// (golden section, Kiefer 1953).
+    /// Moves the last joint on one branch to the least cost between the neighbors of a tested value.
     fn refine(
         &self,
         start: Candidate,
         range: std::ops::RangeInclusive<f64>,
         step: f64,
     ) -> Candidate {
-        const RATIO: f64 = 0.618_033_988_749_894_8;
-        let at = |last_rad: f64| -> Option<Candidate> {
-            let wrist = self.arm.wrist(&self.shoulder_from_seven, last_rad)?;
-            let branches = std::slice::from_ref(&start.branch);
-            self.on_branches(&wrist, last_rad, branches, f64::INFINITY)
-                .next()
+        let branch = start.branch;
+        let sides = Sides {
+            elbow: &[branch.is_elbow_bent],
+            wrist: &[branch.is_wrist_outward],
+            shoulder: &[branch.is_shoulder_forward],
         };
-        let cost_of = |candidate: &Option<Candidate>| candidate.map_or(f64::INFINITY, |it| it.cost);
-        let mut low = (start.joints[6] - step).max(*range.start());
-        let mut high = (start.joints[6] + step).min(*range.end());
-        let mut best = Some(start);
-        let mut inner = [high - RATIO * (high - low), low + RATIO * (high - low)];
-        let mut found = inner.map(at);
-        for _ in 0..N_GOLDEN_STEPS {
-            // Values without a solution have an infinite cost. If neither neighbor has a solution,
-            // the solutions are around the start.
-            let [lower_cost, upper_cost] = [cost_of(&found[0]), cost_of(&found[1])];
-            let is_start_below = start.joints[6] < 0.5 * (low + high);
-            if lower_cost < upper_cost || (lower_cost == upper_cost && is_start_below) {
-                high = inner[1];
-                inner = [high - RATIO * (high - low), inner[0]];
-                found = [at(inner[0]), found[0]];
-            } else {
-                low = inner[0];
-                inner = [inner[1], low + RATIO * (high - low)];
-                found = [found[1], at(inner[1])];
-            }
-            // The better of the two inner values is kept in every step, so no better candidate is
-            // missed.
-            for candidate in found.into_iter().flatten() {
-                keep_better(&mut best, candidate);
+        let mut bracket = Bracket {
+            low: [(start.joints[6] - step).max(*range.start()), f64::INFINITY],
+            best: [start.joints[6], start.cost],
+            high: [(start.joints[6] + step).min(*range.end()), f64::INFINITY],
+        };
+        let mut best = start;
+        for _ in 0..N_REFINEMENTS {
+            let last_rad = bracket.next();
+            let mut found = None;
+            self.compare(last_rad, &sides, &mut found);
+            // Values without a solution have an infinite cost.
+            bracket.narrow([last_rad, found.map_or(f64::INFINITY, |found| found.cost)]);
+            if let Some(found) = found
+                && found.cost < best.cost
+            {
+                best = found;
             }
         }
-        best.expect("it starts with a candidate")
+        best
     }
 }
 
-fn keep_better(best: &mut Option<Candidate>, candidate: Candidate) {
-    if best.is_none_or(|best| candidate.cost < best.cost) {
-        *best = Some(candidate);
+/// Whether a cost is not less than the cost of the best solution so far.
+fn is_worse(cost: f64, best: Option<&Candidate>) -> bool {
+    best.is_some_and(|best| cost >= best.cost)
+}
+
+/// Sides that are compared.
+struct Sides<'a> {
+    elbow: &'a [bool],
+    wrist: &'a [bool],
+    shoulder: &'a [bool],
+}
+
+const BOTH: Sides<'static> = Sides {
+    elbow: &[true, false],
+    wrist: &[true, false],
+    shoulder: &[true, false],
+};
+
+/// The joints from the elbow to the last joint, and their cost. The other joints are not set yet.
+struct Outer {
+    is_elbow_bent: bool,
+    is_wrist_outward: bool,
+    joints: [f64; 7],
+    cost: f64,
+}
+
+/// Three values of the last joint in ascending order, each with its cost. The one in the middle has
+/// the least cost.
+struct Bracket {
+    low: [f64; 2],
+    best: [f64; 2],
+    high: [f64; 2],
+}
+
+impl Bracket {
+    /// The value to test next: the vertex of the parabola through the three costs, or a value in
+    /// the wider interval if a cost is infinite (Brent 1973, chapter 5).
+    fn next(&self) -> f64 {
+        /// Part of an interval at which golden section search divides it.
+        const GOLDEN: f64 = 0.381_966_011_250_105_1;
+        let [low, best, high] = [self.low[0], self.best[0], self.high[0]];
+        let [to_low, to_high] = [best - low, high - best];
+        let [rise_low, rise_high] = [self.low[1] - self.best[1], self.high[1] - self.best[1]];
+        let numerator = to_low * to_low * rise_high - to_high * to_high * rise_low;
+        let denominator = to_low * rise_high + to_high * rise_low;
+        let vertex = best - 0.5 * numerator / denominator;
+        if low < vertex && vertex < high && vertex != best {
+            return vertex;
+        }
+        if to_high > to_low {
+            best + GOLDEN * to_high
+        } else {
+            best - GOLDEN * to_low
+        }
+    }
+
+    /// Takes the cost of a value between the outer ones.
+    fn narrow(&mut self, tested: [f64; 2]) {
+        let outer = if tested[1] < self.best[1] {
+            std::mem::replace(&mut self.best, tested)
+        } else {
+            tested
+        };
+        if outer[0] > self.best[0] {
+            self.high = outer;
+        } else {
+            self.low = outer;
+        }
     }
 }

@@ -181,7 +181,7 @@ impl InverseSolver {
             bounds: &self.bounds,
             comfort: &self.comfort,
             seed,
-            shoulder_from_seven: arm.shoulder_from_seven(&target.base_from_tip),
+            seven: arm.frame_of_seven(&target.base_from_tip),
         };
         let Some(joints) = search.run() else {
             return false;

@@ -29,7 +29,7 @@ mod undrawn;
 
 pub(crate) use clearance_feed::{ClearanceFeed, MIN_STEPS};
 pub(crate) use observer::SteeringObserver;
-pub use standalone::steer_standalone;
+pub use standalone::{drive_standalone, steer_standalone};
 pub use surroundings::Surroundings;
 
 use crate::viewers::Viewers;

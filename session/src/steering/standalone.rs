@@ -1,9 +1,10 @@
-//! Steers an arm without a run.
+//! Steers an arm or a base without a run.
 
+use super::base::PreparedBase;
 use super::surroundings::Surroundings;
 use super::{PreparedArm, PreparedSteering, SteeringThread, robot};
 use capture::config::Rig;
-use capture::open::SteeredArm;
+use capture::open::{SteeredArm, SteeredBase};
 use drivers::motion::SteeringPort;
 use std::sync::Arc;
 use viz::Hub;
@@ -29,6 +30,21 @@ pub fn steer_standalone<S: Surroundings>(
     let prepared = PreparedSteering {
         arm: Some(PreparedArm::new(SteeredArm::holding(port), rig, robot)),
         scene: Some(scene),
+        ..PreparedSteering::of(rig)
+    };
+    prepared.start(hub, None)
+}
+
+/// Lets clients of the hub drive a base, like [`steer_standalone`].
+///
+/// * `rig`: the settings of the base. It must allow unseen space, because nothing is seen.
+///
+/// # Errors
+///
+/// If the configuration is not valid, or no thread can be started.
+pub fn drive_standalone(rig: &Rig, base: SteeredBase, hub: &Hub) -> anyhow::Result<SteeringThread> {
+    let prepared: PreparedSteering = PreparedSteering {
+        base: Some(PreparedBase::new(base, rig, None, false)?),
         ..PreparedSteering::of(rig)
     };
     prepared.start(hub, None)

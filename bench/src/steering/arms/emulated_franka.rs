@@ -2,7 +2,10 @@
 //! limits of a Panda.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use super::{
+    ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, BenchRobot, Emulated, Moved, Patience, Period,
+    RunningArm, motion_limits, robot,
+};
 use anyhow::Result;
 use drivers::Arm;
 use drivers::franka::emulated::{CommandedJoints, EmulatedRobot, Joints, Limits, RobotConfig};
@@ -20,7 +23,9 @@ const PERIOD: Duration = Duration::from_millis(1);
 /// How long the emulated controller waits for the answer to a state. A real one does not wait, and
 /// its driver runs with real-time priority on a computer without other work. Emulated arms of runs
 /// wait equally long.
-const ANSWER_WAIT: Duration = Duration::from_millis(15);
+const PATIENT_WAIT: Duration = Duration::from_millis(15);
+/// The same for a program that is stopped: the controller must notice it soon.
+const PROMPT_WAIT: Duration = Duration::from_millis(2);
 /// A posture with space around it, radians.
 const START_RAD: [f64; N_JOINTS] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
 /// Maximum time of a read, so that the statistics can be read in between.
@@ -28,12 +33,10 @@ const READ_TIMEOUT: Duration = Duration::from_millis(20);
 /// Watchdog of the rig file. The robot brakes earlier, after 20 ms without a command.
 const WATCHDOG: Duration = Duration::from_millis(100);
 
-/// The arm, whose states are read as in a run, and its controller.
+/// The arm, whose states are read as in a run.
 struct Franka {
     arm: Arc<Mutex<MovableFrankaArm>>,
     _thread: ArmThread,
-    /// This field is dropped last, so that the controller answers until the arm is at rest.
-    _controller: EmulatedRobot,
 }
 
 impl RunningArm for Franka {
@@ -42,8 +45,9 @@ impl RunningArm for Franka {
     }
 }
 
-pub(super) fn start() -> Result<BenchArm> {
-    let (robot, chain) = robot("panda")?;
+/// Starts the controller.
+pub(super) fn emulate(patience: Patience) -> Result<Emulated> {
+    let (_, chain) = robot("panda")?;
     let recorder = Recorder::default();
     let config = RobotConfig {
         address: (Ipv4Addr::LOCALHOST, 0).into(),
@@ -52,13 +56,27 @@ pub(super) fn start() -> Result<BenchArm> {
         flange_from_tool: Transform::identity(),
         limits: Limits::panda(),
     };
+    let answer_wait = match patience {
+        Patience::BusyComputer => PATIENT_WAIT,
+        Patience::Little => PROMPT_WAIT,
+    };
     let controller = EmulatedRobot::start_waiting(
         config,
-        ANSWER_WAIT,
+        answer_wait,
         Box::new(recorded_joints(recorder.clone())),
     )?;
-    let config = ArmConfig {
+    Ok(Emulated {
         address: controller.address().to_string(),
+        recorder,
+        _device: Box::new(controller),
+    })
+}
+
+/// Opens the arm of a controller.
+pub(super) fn connect(address: &str) -> Result<BenchRobot> {
+    let (robot, chain) = robot("panda")?;
+    let config = ArmConfig {
+        address: address.to_owned(),
         joint_names: chain.joint_names().to_vec(),
         chain: chain.clone(),
     };
@@ -75,19 +93,22 @@ pub(super) fn start() -> Result<BenchArm> {
         let arm = Arc::clone(&arm);
         move |must_stop| read(&arm, must_stop)
     })?;
-    Ok(BenchArm {
+    Ok(BenchRobot {
         kind: ArmKind::Franka,
-        robot,
-        chain,
-        start: START_RAD.to_vec(),
-        recorder,
+        brake_limits: port.brake_limits().to_vec(),
+        // The controller records the commands that it gets.
+        recorder: Recorder::default(),
         checked_limits: checked_limits(port.brake_limits()),
-        port,
-        period: PERIOD,
+        moved: Moved::Arm(BenchArm {
+            robot,
+            chain,
+            start: START_RAD.to_vec(),
+            port,
+        }),
+        period: Period::Constant(PERIOD),
         running: Box::new(Franka {
             arm,
             _thread: thread,
-            _controller: controller,
         }),
     })
 }

@@ -1,7 +1,10 @@
 //! The driver of arms of Universal Robots with an emulated controller.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, RunningArm, motion_limits, robot};
+use super::{
+    ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, BenchRobot, Emulated, Moved, Patience, Period,
+    motion_limits, robot,
+};
 use anyhow::Result;
 use drivers::Arm;
 use drivers::motion::{MotionConfig, MovableArm, OnLoss, Setpoint};
@@ -16,58 +19,64 @@ use std::time::Duration;
 const PERIOD: Duration = Duration::from_millis(2);
 /// How long the emulated controller waits for the setpoint after a state, so that a busy computer
 /// does not look like an exceeded limit.
-const ANSWER_WAIT: Duration = Duration::from_millis(500);
+const PATIENT_WAIT: Duration = Duration::from_millis(500);
+/// The same for a program that is stopped: the controller must notice it soon.
+const PROMPT_WAIT: Duration = Duration::from_millis(2);
 /// A posture with space around it, radians.
 const START_RAD: [f64; N_JOINTS] = [0.3, -1.4, 1.6, -1.8, -1.5, 0.4];
 /// Maximum time of a read.
 const READ_TIMEOUT: Duration = Duration::from_millis(20);
-/// Time without setpoints after which the program of the controller brakes the arm.
-const WATCHDOG: Duration = Duration::from_secs(1);
-
-/// The thread that reads the states as a run does, with the arm, and its controller.
-struct Ur {
-    _thread: ArmThread,
-    /// This field is dropped last, so that the controller answers until the arm is at rest.
-    _controller: EmulatedController,
-}
-
-impl RunningArm for Ur {}
-
-pub(super) fn start() -> Result<BenchArm> {
-    let (robot, chain) = robot("ur5e")?;
+/// Starts the controller.
+pub(super) fn emulate(patience: Patience) -> Result<Emulated> {
+    let (_, chain) = robot("ur5e")?;
     let recorder = Recorder::default();
+    let answer_wait = match patience {
+        Patience::BusyComputer => PATIENT_WAIT,
+        Patience::Little => PROMPT_WAIT,
+    };
     let controller = EmulatedController::start_waiting(
-        ControllerConfig::e_series(own_address(), chain.clone()),
-        ANSWER_WAIT,
+        ControllerConfig::e_series(own_address(), chain),
+        answer_wait,
         Box::new(recorded_joints(recorder.clone())),
     )?;
-    let config = ArmConfig {
+    Ok(Emulated {
         address: controller.address().to_string(),
+        recorder,
+        _device: Box::new(controller),
+    })
+}
+
+/// Opens the arm of a controller.
+pub(super) fn connect(address: &str, patience: Patience) -> Result<BenchRobot> {
+    let (robot, chain) = robot("ur5e")?;
+    let config = ArmConfig {
+        address: address.to_owned(),
         joint_names: chain.joint_names().to_vec(),
         chain: chain.clone(),
     };
     let motion = MotionConfig {
         limits: motion_limits(&chain),
         on_loss: OnLoss::Hold,
-        timeout: WATCHDOG,
+        timeout: patience.watchdog(),
         accept_no_watchdog: false,
     };
     let mut arm = MovableUrArm::open(&config, &motion)?;
     let port = arm.steering_port(BRAKE_FACTOR)?;
     let thread = ArmThread::spawn(|must_stop| read(arm, must_stop))?;
-    Ok(BenchArm {
+    Ok(BenchRobot {
         kind: ArmKind::Ur,
-        robot,
-        chain,
-        start: START_RAD.to_vec(),
-        recorder,
+        brake_limits: port.brake_limits().to_vec(),
+        // The controller records the setpoints that it gets.
+        recorder: Recorder::default(),
         checked_limits: port.brake_limits().to_vec(),
-        port,
-        period: PERIOD,
-        running: Box::new(Ur {
-            _thread: thread,
-            _controller: controller,
+        moved: Moved::Arm(BenchArm {
+            robot,
+            chain,
+            start: START_RAD.to_vec(),
+            port,
         }),
+        period: Period::Constant(PERIOD),
+        running: Box::new(thread),
     })
 }
 

@@ -2,7 +2,10 @@
 //! setpoint per millisecond on a separate thread.
 
 use super::super::trace::Recorder;
-use super::{ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, brake_limits, motion_limits, robot};
+use super::{
+    ArmKind, ArmThread, BRAKE_FACTOR, BenchArm, BenchRobot, Moved, Period, brake_limits,
+    motion_limits, robot,
+};
 use anyhow::Result;
 use drivers::clock;
 use drivers::motion::{Setpoint, Steered, SteeringPort};
@@ -14,7 +17,7 @@ const PERIOD: Duration = Duration::from_millis(1);
 /// A posture of a Panda with space around it, radians.
 const START_RAD: [f64; 7] = [0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8];
 
-pub(super) fn start() -> Result<BenchArm> {
+pub(super) fn start() -> Result<BenchRobot> {
     let (robot, chain) = robot("panda")?;
     let limits = motion_limits(&chain);
     // A simulated arm has no fault from which it would have to recover.
@@ -25,15 +28,18 @@ pub(super) fn start() -> Result<BenchArm> {
         let recorder = recorder.clone();
         move |must_stop| follow(steered, &recorder, must_stop)
     })?;
-    Ok(BenchArm {
+    Ok(BenchRobot {
         kind: ArmKind::Simulated,
-        robot,
-        chain,
-        start: START_RAD.to_vec(),
+        brake_limits: port.brake_limits().to_vec(),
         recorder,
         checked_limits: brake_limits(&limits, BRAKE_FACTOR),
-        port,
-        period: PERIOD,
+        moved: Moved::Arm(BenchArm {
+            robot,
+            chain,
+            start: START_RAD.to_vec(),
+            port,
+        }),
+        period: Period::Constant(PERIOD),
         running: Box::new(thread),
     })
 }
