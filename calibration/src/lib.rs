@@ -38,6 +38,7 @@ pub mod least_squares;
 mod params;
 mod redrawn;
 mod registration;
+mod scan_matching;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
 mod tag_check;
@@ -63,5 +64,6 @@ pub use registration::{
     MovementDetector, PoseEstimate, PoseSigmas, ScalarEstimate, StationCorrection, Unobservable,
     align, candidates, compare_halves, register_station,
 };
+pub use scan_matching::{DriftTracker, ScanMatch, ScanOutcome, SurfaceMap, match_scan};
 pub use tag_check::{ContradictionCause, TagCheck, TagContradiction, TagObservation};
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

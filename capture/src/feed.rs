@@ -454,6 +454,15 @@ impl Pump {
         });
     }
 
+    /// The current correction of reported base poses, by range scans or by stations.
+    fn map_from_odom(&self) -> Transform {
+        let stations = self.input.stations.as_ref();
+        stations.map_or_else(
+            || self.input.join.map_from_reported(),
+            Stations::map_from_odom,
+        )
+    }
+
     /// Passes the state of the robot to the observer.
     fn publish_robot(&mut self, sample: &Sample) {
         let Some(mut state) = self
@@ -464,9 +473,7 @@ impl Pump {
         else {
             return;
         };
-        if let Some(stations) = &self.input.stations {
-            state.world_from_base = stations.map_from_odom() * state.world_from_base;
-        }
+        state.world_from_base = self.map_from_odom() * state.world_from_base;
         self.observer.observe_robot(state);
     }
 

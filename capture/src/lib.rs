@@ -56,6 +56,7 @@ mod nearest_name;
 mod notes;
 pub mod open;
 mod outputs;
+mod pose_distance;
 mod record;
 mod recorded_meshes;
 mod requested_motion;
@@ -79,13 +80,16 @@ pub use config::{ConfigError, Override, Rig};
 pub use feed::{Feed, FeedItem, Input, InputObserver, InputResult, InputTimes};
 pub use found_devices::{ChangeKind, DeviceChange, DeviceInfo, DeviceWatch, found_devices};
 pub use input_counts::InputCounts;
-pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse};
+pub use join::{
+    Change, Counts, DriftReport, Join, JoinEvent, PosedImage, Rejection, SampleUse, StoreUse,
+};
 pub use live_pixels::live_pixels;
 pub use mesh_files::MeshKind;
 pub use mesh_triangles::{Triangle, mesh_triangles};
 pub use nearest_name::nearest_name;
 pub use notes::Notes;
 pub use outputs::{check_output_file, check_output_folder};
+pub use pose_distance::PoseDistance;
 pub use record::{RecordPlan, Recorded, WrittenRecording};
 pub use recorded_meshes::RecordedMeshes;
 pub use requested_motion::{Arrival, RequestedMotion, format_positions};

@@ -11,6 +11,7 @@
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
+use crate::pose_distance::PoseDistance;
 use background::{Task, run_in_background_pool};
 use calibration::{MIN_VALIDATION_IMAGES, StationCorrection, register_station};
 use keyframe::{BaseState, Keyframe, Split};
@@ -127,19 +128,14 @@ pub struct StationReport {
     base_error: Option<[PoseDistance; 2]>,
 }
 
-/// Distance between two poses.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-struct PoseDistance {
-    m: f64,
-    rad: f64,
-}
-
 impl Stations {
-    /// Corrections for the base of a rig. `None` if the base does not move, or if
-    /// [`Base::realign`](crate::config::Base::realign) is not set.
+    /// Corrections for the base of a rig. `None` if the base does not move, if
+    /// [`Base::realign`](crate::config::Base::realign) is not set, or if the rig has a range
+    /// scanner, because its scans correct the base all the time ([`Join::drift`](crate::Join)).
     #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
-        if rig.base.driver == BaseDriver::Fixed || !rig.base.realign {
+        let is_corrected_by_scans = !rig.scanners.is_empty();
+        if rig.base.driver == BaseDriver::Fixed || !rig.base.realign || is_corrected_by_scans {
             return None;
         }
         let on_base = rig
@@ -550,15 +546,6 @@ fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Ch
     }
 }
 
-/// An error of the base pose in the units of the printed line.
-fn format_error(base_error: PoseDistance) -> String {
-    format!(
-        "{:.1} mm and {:.2} degrees",
-        1e3 * base_error.m,
-        base_error.rad.to_degrees()
-    )
-}
-
 impl StationReport {
     fn new(
         base_state: &BaseState,
@@ -568,11 +555,7 @@ impl StationReport {
     ) -> Self {
         let base_error = base_state.truth.map(|truth| {
             [before, after].map(|map_from_odom| {
-                let base = map_from_odom * base_state.world_from_base;
-                PoseDistance {
-                    m: (base.translation.vector - truth.translation.vector).norm(),
-                    rad: base.rotation.angle_to(&truth.rotation),
-                }
+                PoseDistance::between(&(map_from_odom * base_state.world_from_base), &truth)
             })
         });
         Self {
@@ -612,12 +595,7 @@ impl std::fmt::Display for StationReport {
             write!(f, "; not observable: {unobservable}")?;
         }
         if let Some([before, after]) = self.base_error {
-            write!(
-                f,
-                "; error {} before, {} after",
-                format_error(before),
-                format_error(after)
-            )?;
+            write!(f, "; error {before} before, {after} after")?;
         }
         Ok(())
     }

@@ -9,7 +9,7 @@ use crate::training_options::{AvailableData, MIN_IMAGES_PER_CAMERA};
 use anyhow::ensure;
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
-use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
+use capture::{DriftReport, Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
 use drivers::Sample;
 use gpu::Gpu;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split};
@@ -176,6 +176,8 @@ pub struct Data {
     pub data_losses: Vec<String>,
     /// The correction of the base pose at each station after the first.
     pub stations: Vec<StationReport>,
+    /// What range scans showed about the drift of the base; `None` if they did not correct it.
+    pub drift: Option<DriftReport>,
     /// Depth that was rendered from a model for images without depth.
     pub rendered_depth: Option<RenderedDepth>,
     /// Time spent on station registration and depth rendering, which precede training but count as
@@ -478,6 +480,7 @@ impl Data {
             has_times: folder.has_times(),
             data_losses: loaded.data_losses,
             stations: Vec::new(),
+            drift: None,
             rendered_depth: None,
             preparation_time: Duration::ZERO,
         };
@@ -543,6 +546,9 @@ impl Data {
         apply(&mut keyframes, join.finish());
         report(progress, "keyframes", keyframes.len(), None);
         log::info!("{}", join.counts());
+        if let Some(drift) = join.drift() {
+            log::info!("{drift}");
+        }
         let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(damage.get().cloned());
         data_losses.extend(join.check_list()?);
@@ -555,6 +561,7 @@ impl Data {
             has_times: true,
             data_losses,
             stations: Vec::new(),
+            drift: join.drift().cloned(),
             rendered_depth: None,
             preparation_time: Duration::ZERO,
         })

@@ -6,7 +6,7 @@
 //! no times, so that replaying it with the same data gives the same model.
 
 use anyhow::{Context, anyhow};
-use keyframe::{Keyframe, Split, split_from_name, split_name};
+use keyframe::{BaseState, Keyframe, Split, split_from_name, split_name};
 use kinematics::transform::{from_xyz_xyzw, to_xyz_xyzw};
 use kinematics::{Stamp, Transform};
 use messages::BadInput;
@@ -201,12 +201,15 @@ impl Pushed {
         }
     }
 
-    /// The keyframe as it was added: `reported` with the logged correction of its base pose
-    /// applied.
-    pub(crate) fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
+    /// The keyframe as it was added: `read` with the logged correction of its base pose applied.
+    /// Range scans have already corrected it while the recording was read.
+    pub(crate) fn corrected(&self, read: &Arc<Keyframe>) -> Arc<Keyframe> {
+        let is_corrected = |base: &BaseState| is_motion(&base.map_from_odom);
         match self.map_from_odom {
-            Some(numbers) => Arc::new(reported.with_base_correction(&from_xyz_xyzw(numbers))),
-            None => reported.clone(),
+            Some(numbers) if !read.base.as_ref().is_some_and(is_corrected) => {
+                Arc::new(read.with_base_correction(&from_xyz_xyzw(numbers)))
+            }
+            _ => read.clone(),
         }
     }
 

@@ -1,5 +1,6 @@
 //! Camera poses and velocities at a stamp, and the resulting image motion.
 
+use super::drift::{Corrections, JumpRemoval};
 use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
 use anyhow::Context;
@@ -83,9 +84,25 @@ enum BaseMotion {
 /// Poses of a moving base.
 struct ReportedPoses {
     poses: PoseHistory,
+    /// Corrections for the drift of these poses.
+    corrections: Corrections,
+    /// `None` if jumps are kept, because nothing corrects these poses.
+    jump_removal: Option<JumpRemoval>,
     station_detector: StationDetector,
     /// Ground truth poses from a simulator.
     truth: PoseHistory,
+}
+
+/// Whether range scans correct the poses of a rig's base.
+pub(super) fn corrects_base(rig: &Rig) -> bool {
+    rig.base.driver != BaseDriver::Fixed && rig.base.realign && !rig.scanners.is_empty()
+}
+
+impl ReportedPoses {
+    /// The corrected pose at a stamp.
+    fn at(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
+        Ok(self.corrections.at(stamp) * self.poses.at(stamp)?)
+    }
 }
 
 /// A camera's pose and velocity at a stamp.
@@ -141,6 +158,8 @@ impl Motion {
                 let poses = || PoseHistory::new(max_base_gap, MAX_READINGS);
                 BaseMotion::ReportedPoses(Box::new(ReportedPoses {
                     poses: poses(),
+                    corrections: Corrections::default(),
+                    jump_removal: corrects_base(rig).then(JumpRemoval::default),
                     station_detector: StationDetector::default(),
                     truth: poses(),
                 }))
@@ -275,16 +294,15 @@ impl Motion {
         match &mut self.base {
             BaseMotion::Fixed(_) => true,
             BaseMotion::ReportedPoses(reported) => {
-                let is_valid = reported
-                    .poses
-                    .push(pose.stamp, pose.world_from_base)
-                    .is_ok();
+                let odom_from_base = match &mut reported.jump_removal {
+                    Some(jumps) => jumps.continued(pose.stamp, &pose.world_from_base),
+                    None => pose.world_from_base,
+                };
+                let is_valid = reported.poses.push(pose.stamp, odom_from_base).is_ok();
                 if is_valid {
                     // A pose that the history has rejected must not end a station, because it is
                     // out of order or not finite.
-                    reported
-                        .station_detector
-                        .push(pose.stamp, &pose.world_from_base);
+                    reported.station_detector.push(pose.stamp, &odom_from_base);
                 }
                 is_valid
             }
@@ -297,6 +315,10 @@ impl Motion {
         if let BaseMotion::ReportedPoses(reported) = &mut self.base {
             reported.poses.clear();
             reported.truth.clear();
+            reported.corrections = Corrections::default();
+            if let Some(jump_removal) = &mut reported.jump_removal {
+                *jump_removal = JumpRemoval::default();
+            }
             reported.station_detector.restart();
         }
     }
@@ -309,20 +331,57 @@ impl Motion {
         }
     }
 
-    /// The base pose at a stamp; `NotYet` if no pose at or after the stamp has arrived.
-    pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
-        match &self.base {
-            BaseMotion::Fixed(pose) => Ok(*pose),
-            BaseMotion::ReportedPoses(reported) => reported.poses.at(stamp),
+    /// Moves base poses from this stamp on, in addition to earlier corrections.
+    pub(super) fn correct_base(&mut self, stamp: Stamp, motion: &Transform) {
+        if let BaseMotion::ReportedPoses(reported) = &mut self.base {
+            let map_from_odom = motion * reported.corrections.newest();
+            reported.corrections.push(stamp, map_from_odom);
         }
     }
 
-    /// `world_from_base` and the twist of the base in base axes at a stamp; `NotYet` if no pose at
-    /// or after the stamp has arrived.
+    /// The newest correction of base poses as they are reported, with their jumps.
+    pub(super) fn map_from_reported(&self) -> Transform {
+        let BaseMotion::ReportedPoses(reported) = &self.base else {
+            return Transform::identity();
+        };
+        let newest = reported.corrections.newest();
+        let jumps = reported.jump_removal.as_ref();
+        jumps.map_or(newest, |jumps| newest * jumps.continuous_from_reported())
+    }
+
+    /// The reported and the corrected base pose at a stamp; `None` if they are not known.
+    pub(super) fn base_poses(&self, stamp: Stamp) -> Option<[Transform; 2]> {
+        let BaseMotion::ReportedPoses(reported) = &self.base else {
+            return None;
+        };
+        Some([reported.poses.at(stamp).ok()?, reported.at(stamp).ok()?])
+    }
+
+    /// The true base pose at a stamp, from a simulator.
+    pub(super) fn true_base(&self, stamp: Stamp) -> Option<Transform> {
+        let BaseMotion::ReportedPoses(reported) = &self.base else {
+            return None;
+        };
+        reported.truth.at(stamp).ok()
+    }
+
+    /// The corrected base pose at a stamp; `NotYet` if no pose at or after the stamp has arrived.
+    pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
+        match &self.base {
+            BaseMotion::Fixed(pose) => Ok(*pose),
+            BaseMotion::ReportedPoses(reported) => reported.at(stamp),
+        }
+    }
+
+    /// The corrected `world_from_base` and the twist of the base in base axes at a stamp; `NotYet`
+    /// if no pose at or after the stamp has arrived.
     pub(super) fn base_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
         match &self.base {
             BaseMotion::Fixed(pose) => Ok((*pose, Twist::zero())),
-            BaseMotion::ReportedPoses(reported) => reported.poses.with_twist_at(stamp),
+            BaseMotion::ReportedPoses(reported) => {
+                let (odom_from_base, twist) = reported.poses.with_twist_at(stamp)?;
+                Ok((reported.corrections.at(stamp) * odom_from_base, twist))
+            }
         }
     }
 
@@ -339,11 +398,13 @@ impl Motion {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
-                let (world_from_base, twist) = reported.poses.with_twist_at(stamp)?;
+                let (odom_from_base, twist) = reported.poses.with_twist_at(stamp)?;
+                let map_from_odom = reported.corrections.at(stamp);
+                let world_from_base = map_from_odom * odom_from_base;
                 let base_state = BaseState {
                     station: reported.station_detector.at(stamp),
-                    world_from_base,
-                    map_from_odom: Transform::identity(),
+                    world_from_base: odom_from_base,
+                    map_from_odom,
                     truth: reported.truth.at(stamp).ok(),
                 };
                 (world_from_base, twist, Some(base_state))

@@ -7,6 +7,7 @@ mod accept;
 mod assemble;
 mod camera_motion;
 mod change;
+mod drift;
 mod pixels;
 mod ranges;
 mod rejection;
@@ -19,6 +20,7 @@ mod waiting;
 
 pub(crate) use camera_motion::{CameraPose, JointsRejection, Motion};
 pub use change::Change;
+pub use drift::DriftReport;
 pub use rejection::{Counts, Rejection, SampleUse};
 pub use store::StoreUse;
 
@@ -271,6 +273,7 @@ impl Join {
         // Images that still wait belong to the motion before the jump, so they are decided first.
         let events = self.finish();
         self.motion.restart();
+        self.ranges.restart();
         if let Some(robot_masks) = &mut self.robot_masks {
             robot_masks.restart();
         }
@@ -297,6 +300,17 @@ impl Join {
     /// The newest scans of range scanners, with points in the world frame, oldest first.
     pub fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
         self.ranges.iter()
+    }
+
+    /// The newest correction of the reported base poses, which range scans give.
+    pub(crate) fn map_from_reported(&self) -> Transform {
+        self.motion.map_from_reported()
+    }
+
+    /// What range scans showed about the drift of the base; `None` if they are not used for this.
+    #[must_use]
+    pub fn drift(&self) -> Option<&DriftReport> {
+        self.ranges.drift()
     }
 
     /// Compares the result with the list of [`Join::taking_only`], as [`KeyframeList::check_found`]
@@ -387,7 +401,7 @@ impl Join {
     fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
         let counts_placed =
             self.ranges
-                .process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
+                .process_ready(&mut self.motion, self.newest, at_end, self.max_wait_secs);
         self.counts.range_scans += counts_placed.n_placed;
         self.counts.range_scans_rejected += counts_placed.n_rejected;
         events.extend(

@@ -1,7 +1,8 @@
 //! Range scans: transforms each point to the world frame with the scanner pose at the time of that
-//! point.
+//! point, and matches scans with earlier ones to correct the drift of the base.
 
-use super::camera_motion::Motion;
+use super::camera_motion::{Motion, corrects_base};
+use super::drift::{DriftReport, ScanCorrection};
 use crate::config::{Rig, Scanner};
 use drivers::RangeScan;
 use keyframe::{DepthMap, Keyframe, RangePoints};
@@ -29,6 +30,8 @@ pub(super) struct RangeScans {
     waiting: VecDeque<RangeScan>,
     kept: VecDeque<Arc<RangePoints>>,
     max_kept: usize,
+    /// `None` if base poses are used as reported.
+    correction: Option<ScanCorrection>,
 }
 
 /// Counts of processed scans.
@@ -46,7 +49,20 @@ impl RangeScans {
             waiting: VecDeque::new(),
             kept: VecDeque::new(),
             max_kept,
+            correction: corrects_base(rig).then(ScanCorrection::default),
         }
+    }
+
+    /// Forgets the surfaces, because the source has restarted.
+    pub(super) fn restart(&mut self) {
+        if let Some(correction) = &mut self.correction {
+            correction.restart();
+        }
+    }
+
+    /// What the scans showed about the drift of the base; `None` if they are not used for this.
+    pub(super) fn drift(&self) -> Option<&DriftReport> {
+        self.correction.as_ref().map(ScanCorrection::report)
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
@@ -145,7 +161,7 @@ impl RangeScans {
     /// than `max_wait_secs`.
     pub(super) fn process_ready(
         &mut self,
-        motion: &Motion,
+        motion: &mut Motion,
         newest: Stamp,
         at_end: bool,
         max_wait_secs: f64,
@@ -157,6 +173,10 @@ impl RangeScans {
             match self.in_world(scan, motion) {
                 Ok(in_world) => {
                     counts_placed.n_placed += 1;
+                    let in_world = match &mut self.correction {
+                        Some(correction) => correction.correct(in_world, motion),
+                        None => in_world,
+                    };
                     self.kept.push_back(Arc::new(in_world));
                     while self.kept.len() > self.max_kept {
                         self.kept.pop_front();
@@ -253,6 +273,7 @@ mod tests {
             waiting: VecDeque::new(),
             kept: kept.collect(),
             max_kept: 9,
+            correction: None,
         }
     }
 

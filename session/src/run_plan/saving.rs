@@ -14,7 +14,7 @@ use crate::verdict::ImageLoss;
 use crate::viewer::ServedModel;
 use crate::{corrected_rig, recovery, served_files};
 use capture::config::Rig;
-use capture::{Counts, InputResult, SampleUse, StationReport};
+use capture::{Counts, DriftReport, InputResult, SampleUse, StationReport};
 use keyframe::{Keyframe, Split};
 use messages::InsufficientData;
 use serde::Serialize;
@@ -203,6 +203,9 @@ pub(super) fn save(
     };
     let listed = sessions.iter().zip(&folders).try_for_each(list);
     log::info!("{}", input_result.join.counts());
+    if let Some(drift) = input_result.join.drift() {
+        log::info!("{drift}");
+    }
     // Commands that score the model later need a complete recording at this path.
     let is_moved = plan.record.as_ref().is_some_and(|file| !file.exists());
     let is_recorded = input_result.recording_error.is_none() && !is_moved;
@@ -319,6 +322,9 @@ struct RunDetails {
     resume_command: Option<String>,
     /// Estimated base pose at each station after the first.
     stations: Vec<StationReport>,
+    /// What range scans showed about the drift of the base.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    drift: Option<DriftReport>,
     /// Durations from mid-exposure to the model and to viewers, by name; only for the first model.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     latencies: Vec<(String, Latency)>,
@@ -372,6 +378,7 @@ impl DetailsOfRun<'_> {
             stations: stations
                 .as_ref()
                 .map_or(Vec::new(), |stations| stations.reports().to_vec()),
+            drift: join.drift().cloned(),
             latencies: std::mem::take(&mut self.latencies),
             max_position_error_m: self.max_position_error_m,
         }

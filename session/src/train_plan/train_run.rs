@@ -15,8 +15,8 @@ use crate::session_setup::{Services, SessionSetup};
 use crate::training_clock::Clock;
 use crate::training_options::REALIGN;
 use crate::{corrected_rig, recoveries, recovery};
-use capture::StationReport;
 use capture::config::{Override, Rig};
+use capture::{DriftReport, StationReport};
 use gpu::Gpu;
 use keyframe::Split;
 use messages::{BadInput, Setting, counted};
@@ -80,6 +80,9 @@ struct TrainDetails<'a> {
     resume_command: Option<String>,
     /// Estimated base pose at each station after the first.
     stations: &'a [StationReport],
+    /// What range scans showed about the drift of the base.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    drift: Option<&'a DriftReport>,
     /// Amount of depth that was rendered from a model.
     #[serde(skip_serializing_if = "Option::is_none")]
     rendered_depth: Option<&'a RenderedDepth>,
@@ -394,6 +397,7 @@ impl TrainRun<'_> {
                         .are_written()
                         .then(|| self.plan.resume_command().line(&out)),
                     stations: &data.stations,
+                    drift: data.drift.as_ref(),
                     rendered_depth: data.rendered_depth.as_ref(),
                 },
                 session,
