@@ -1,6 +1,7 @@
 //! A simulated arm that is taken over from its tour, while nobody reads the samples of its rig.
 
-use super::{Devices, Opened, SteeredArm, steered};
+use super::steered::steered;
+use super::{Devices, Opened, SteeredArm};
 use crate::config::{Override, Rig};
 use drivers::motion::{ArmState, Output, Target};
 use drivers::{Sample, clock};

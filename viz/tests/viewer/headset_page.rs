@@ -46,16 +46,13 @@ pub(crate) fn iwer() -> Option<String> {
 /// The page in a browser with a headset.
 pub(crate) struct Headset {
     pub(crate) browser: Browser,
-    profile: PathBuf,
 }
 
 impl Headset {
-    pub(crate) fn open(program: &Path, url: &str, name: &str, script: &str) -> Option<Self> {
+    pub(crate) fn open(program: &Path, url: &str, script: &str) -> Option<Self> {
         let script = format!("{}\n{HEADSET}\n{script}", iwer()?);
-        let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-            .join(format!("chromium-headset-{name}-{}", std::process::id()));
-        let browser = Browser::open_with(program, &profile, url, WINDOW_PX, &script);
-        Some(Self { browser, profile })
+        let browser = Browser::open_with(program, url, WINDOW_PX, &script);
+        Some(Self { browser })
     }
 
     pub(crate) fn wait_until(&mut self, what: &str, expression: &str) {
@@ -130,11 +127,6 @@ impl Headset {
         image::load_from_memory_with_format(&png, image::ImageFormat::Png)
             .expect("a PNG")
             .to_rgb8()
-    }
-
-    pub(crate) fn finish(self) {
-        drop(self.browser);
-        std::fs::remove_dir_all(&self.profile).expect("the browser has left its profile");
     }
 }
 
@@ -262,7 +254,7 @@ fn both_eyes_see_the_model_that_the_trainer_draws() {
     let thread = ModelThread::start(hub.clone(), models);
     let server = serve(&hub, 0);
     let port = port_of(&server);
-    let Some(mut headset) = Headset::open(&program, &server.url(), "eyes", "") else {
+    let Some(mut headset) = Headset::open(&program, &server.url(), "") else {
         return;
     };
     wait_for(&mut headset.browser, "a full picture", |browser| {
@@ -301,7 +293,6 @@ fn both_eyes_see_the_model_that_the_trainer_draws() {
     check_eyes(&mut headset, &mut reference_tsdf, "mesh-again");
     headset.browser.evaluate("device.activeSession.end()");
     headset.wait_until_left();
-    headset.finish();
     drop(thread.finish());
     drop(server);
 }
@@ -318,7 +309,7 @@ fn the_layers_of_a_headset_show_the_same_pictures() {
     let mut reference = splat_model(&splats);
     let thread = ModelThread::start(hub.clone(), models);
     let server = serve(&hub, 0);
-    let Some(mut headset) = Headset::open(&program, &server.url(), "layers", LAYERS) else {
+    let Some(mut headset) = Headset::open(&program, &server.url(), LAYERS) else {
         return;
     };
     wait_for(&mut headset.browser, "a full picture", |browser| {
@@ -343,7 +334,6 @@ fn the_layers_of_a_headset_show_the_same_pictures() {
     assert_eq!(viewport, [half, 0.0, half, half]);
     headset.browser.evaluate("device.activeSession.end()");
     headset.wait_until_left();
-    headset.finish();
     drop((thread.finish(), server));
 }
 

@@ -30,7 +30,7 @@ fn hands_in_a_headset_steer_with_a_held_trigger() {
         listen: ([127, 0, 0, 1], 0).into(),
     };
     let server = Server::start(config, hub.clone()).expect("a free port");
-    let Some(mut headset) = Headset::open(&program, &server.url(), "steering", "") else {
+    let Some(mut headset) = Headset::open(&program, &server.url(), "") else {
         return;
     };
     let arm = ScriptedArm::start(FOLLOWS_MILLIS);
@@ -62,7 +62,6 @@ fn hands_in_a_headset_steer_with_a_held_trigger() {
     headset.wait_until_left();
     wait_for_release(&mut headset, &far, "the headset was left");
     publish_steering(&hub, None);
-    headset.finish();
     drop((far, thread, server));
 }
 

@@ -52,10 +52,9 @@ fn participants_are_led_through_five_conditions_with_three_tasks() {
     };
     let server = Server::start(config, hub).expect("a free port");
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
-    let profile = scratch.join(format!("chromium-study-{}", std::process::id()));
     let url = format!("{}?study", server.url());
     let script = format!("{NO_DRAWING}\n{KEEP_FILES}");
-    let mut browser = Browser::open_with(&program, &profile, &url, WINDOW_PX, &script);
+    let mut browser = Browser::open_with(&program, &url, WINDOW_PX, &script);
     for participant in 1..=2 {
         participate(&mut browser, participant, &scratch);
     }
@@ -77,7 +76,6 @@ fn participants_are_led_through_five_conditions_with_three_tasks() {
         std::fs::write(scratch.join(name), svg).expect("written");
     }
     drop(browser);
-    std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Waits for a step of the study.

@@ -7,7 +7,6 @@ use crate::request_thread::RequestThread;
 use analytic_scene::{draw, looking_along_y};
 use nalgebra::Translation3;
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 use trainer::RenderRequest;
@@ -37,7 +36,6 @@ type Requests = Arc<Mutex<Vec<RenderRequest>>>;
 struct Page {
     browser: Browser,
     requests: Requests,
-    profile: PathBuf,
     url: String,
     /// Stops when it is dropped, before the server.
     _renderer: RequestThread,
@@ -45,7 +43,7 @@ struct Page {
 }
 
 impl Page {
-    fn open(program: &std::path::Path, name: &str, hub: &Hub) -> Self {
+    fn open(program: &std::path::Path, hub: &Hub) -> Self {
         hub.set_scene_hint(SceneHint {
             center_m: [0.0, 0.0, 0.2],
             radius_m: 0.8,
@@ -63,18 +61,15 @@ impl Page {
             received.lock().expect("no panic").push(request);
             pending.deliver(picture);
         });
-        let profile = PathBuf::from(env!("CARGO_TARGET_TMPDIR"))
-            .join(format!("chromium-{name}-{}", std::process::id()));
         let url = server.url();
         let script = format!("{NO_DRAWING}\n{KEEP_FILES}");
-        let mut browser = Browser::open_with(program, &profile, &url, WINDOW_PX, &script);
+        let mut browser = Browser::open_with(program, &url, WINDOW_PX, &script);
         wait_for(&mut browser, "a full picture", |browser| {
             browser.text("picture-text").contains("100 %")
         });
         Self {
             browser,
             requests,
-            profile,
             url,
             _renderer: renderer,
             _server: server,
@@ -127,14 +122,6 @@ impl Page {
             browser.text("toast").contains(part)
         });
     }
-
-    fn close(self) {
-        let Self {
-            browser, profile, ..
-        } = self;
-        drop(browser);
-        std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
-    }
 }
 
 #[test]
@@ -142,7 +129,7 @@ fn a_workspace_is_saved_and_opened_again() {
     let Some(program) = browser_for_page() else {
         return;
     };
-    let mut page = Page::open(&program, "workspace", &Hub::new());
+    let mut page = Page::open(&program, &Hub::new());
     let press = |page: &mut Page, key: &str| {
         page.browser.evaluate(&format!(
             "void document.body.dispatchEvent(new KeyboardEvent('keydown', \
@@ -214,7 +201,6 @@ fn a_workspace_is_saved_and_opened_again() {
     assert_eq!(page.pressed("toggle-crop"), json!("true"));
     page.drop_file("photo.jpg", "\u{ffd8}\u{ffe0}");
     page.wait_for_message("photo.jpg cannot be opened: it is not JSON");
-    page.close();
 }
 
 #[test]
@@ -232,7 +218,7 @@ fn a_page_starts_with_the_workspace_of_its_server() {
     std::fs::write(&path, file.to_string()).expect("written");
     let hub = Hub::new();
     hub.set_workspace(Workspace::read(&path).expect("a workspace"));
-    let mut page = Page::open(&program, "workspace-start", &hub);
+    let mut page = Page::open(&program, &hub);
     page.wait_for_eye(EYE_M);
     assert_eq!(page.pressed("toggle-grid"), json!("false"));
 
@@ -243,5 +229,4 @@ fn a_page_starts_with_the_workspace_of_its_server() {
     page.browser.call("Page.navigate", json!({"url": url}));
     page.wait_for_eye(linked);
     assert_eq!(page.pressed("toggle-grid"), json!("true"));
-    page.close();
 }
