@@ -43,7 +43,8 @@ use crate::findings::{BenchResult, Findings};
 use anyhow::{Context, Result};
 use rig::SteeredRig;
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
 /// Options of [`run`]. A part with the size 0 is left out.
 #[derive(Clone, Debug)]
@@ -64,10 +65,22 @@ pub struct SteeringOptions {
     pub n_goals: u32,
     /// Views that the scan never had; `None` leaves them out.
     pub views: Option<ViewOptions>,
-    /// The program that is stopped and killed: this one. `None` leaves these faults out.
-    pub program: Option<PathBuf>,
+    /// Other processes of this program, some of which are stopped and killed. `None` leaves these
+    /// faults out.
+    pub processes: Option<Processes>,
     /// Folder for charts and numbers.
     pub out: PathBuf,
+}
+
+/// Commands that start this program again. Their output is read.
+#[derive(Clone, Copy, Debug)]
+pub struct Processes {
+    /// Steers the robot whose emulated device is at an address ([`serve_robot`]), and prints the
+    /// address of its server.
+    pub serve: fn(ArmKind, address: &str) -> Result<Command>,
+    /// Runs a rig file as a simulation that an operator may steer. It prints its events as JSON and
+    /// writes to a folder.
+    pub run: fn(rig: &Path, out: &Path) -> Result<Command>,
 }
 
 /// Results so far.
@@ -106,9 +119,8 @@ pub fn run(
         measure_goals(options, &mut results)?;
     }
     if let Some(views) = &options.views {
-        let program = options.program.as_deref();
-        let program = program.context("the program that is steered is not known")?;
-        results.views = views::measure(views, program, &options.out.join("run"))?;
+        let processes = options.processes.context("no run can be started")?;
+        results.views = views::measure(views, processes.run, &options.out.join("run"))?;
     }
     for arm in &options.arms {
         let is_tracked = options.tracking_secs > 0.0 && !arm.is_base();
@@ -152,7 +164,7 @@ pub fn run(
 
 /// The faults that end the program, with the devices that they concern.
 fn faults_of_programs(options: &SteeringOptions) -> Vec<(ArmKind, Fault)> {
-    if options.n_trials == 0 || options.program.is_none() {
+    if options.n_trials == 0 || options.processes.is_none() {
         return Vec::new();
     }
     let faults = options.faults.iter().filter(|fault| fault.ends_program());
@@ -165,10 +177,9 @@ fn faults_of_programs(options: &SteeringOptions) -> Vec<(ArmKind, Fault)> {
 
 #[cfg(all(feature = "sim", target_os = "linux"))]
 fn end_program(options: &SteeringOptions, arm: ArmKind, fault: Fault) -> Result<FaultRow> {
-    let program = options.program.as_deref();
-    let program = program.context("the program that is stopped is not known")?;
+    let processes = options.processes.context("no program can be stopped")?;
     log::info!("{}: {}", arm.name(), fault.title());
-    stopped_program::measure(arm, fault, options.n_trials, program)
+    stopped_program::measure(arm, fault, options.n_trials, processes.serve)
 }
 
 #[cfg(not(all(feature = "sim", target_os = "linux")))]

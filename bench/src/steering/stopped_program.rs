@@ -18,7 +18,6 @@ use nalgebra::Vector3;
 use numbers::random::Random;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
-use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -67,13 +66,13 @@ pub(super) fn measure(
     kind: ArmKind,
     fault: Fault,
     n_trials: u32,
-    program: &Path,
+    serve: Serve,
 ) -> Result<FaultRow> {
     let mut random = Random::new(u64::from(n_trials));
     let mut outcomes = Vec::new();
     let mut n_repeated = 0;
     while outcomes.len() < n_trials as usize && n_repeated <= MAX_REPEATS * n_trials {
-        match try_once(kind, fault, program, &mut random)? {
+        match try_once(kind, fault, serve, &mut random)? {
             Some(outcome) => outcomes.push(outcome),
             None => n_repeated += 1,
         }
@@ -85,11 +84,11 @@ pub(super) fn measure(
 fn try_once(
     kind: ArmKind,
     fault: Fault,
-    program: &Path,
+    serve: Serve,
     random: &mut Random,
 ) -> Result<Option<Outcome>> {
     let emulated = arms::emulate(kind, Patience::Little)?;
-    let mut running = RunningProgram::start(program, kind, &emulated)?;
+    let mut running = RunningProgram::start(serve, kind, &emulated)?;
     let mut client = SteeringClient::connect(running.server, 0)?;
     client.lease("take")?;
     let number = client.number();
@@ -153,6 +152,9 @@ fn start_moving(
     Ok(false)
 }
 
+/// Command of the process, see [`Processes::serve`](super::Processes::serve).
+type Serve = fn(ArmKind, &str) -> Result<Command>;
+
 /// The process that moves the robot. Dropping it kills it.
 struct RunningProgram {
     child: Child,
@@ -160,15 +162,13 @@ struct RunningProgram {
 }
 
 impl RunningProgram {
-    fn start(program: &Path, kind: ArmKind, emulated: &Emulated) -> Result<Self> {
-        let robot = format!("{}={}", kind.name(), emulated.address);
-        let mut child = Command::new(program)
-            .args(["bench", "steering", "--serve", &robot])
+    fn start(serve: Serve, kind: ArmKind, emulated: &Emulated) -> Result<Self> {
+        let mut child = serve(kind, &emulated.address)?
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
-            .with_context(|| format!("cannot start {}", program.display()))?;
+            .context("cannot start the program that is stopped")?;
         let stdout = child.stdout.take().context("the process has no output")?;
         let mut line = String::new();
         let read = BufReader::new(stdout).read_line(&mut line);

@@ -14,7 +14,7 @@ fn one_trial_of_each_fault_brakes_the_arm_within_its_limits() {
         n_grips: 0,
         n_goals: 0,
         views: None,
-        program: None,
+        processes: None,
         out: folder.path().to_owned(),
     };
     let mut rows = Vec::new();

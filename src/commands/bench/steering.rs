@@ -5,9 +5,10 @@ use crate::exit::Exit;
 use crate::number_args::number_in_range;
 use crate::print;
 use anyhow::Context;
-use bench::steering::{ArmKind, Fault, FaultRow, SteeringOptions, ViewOptions};
+use bench::steering::{ArmKind, Fault, FaultRow, Processes, SteeringOptions, ViewOptions};
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::Duration;
 
 /// Flags of `bench steering`.
@@ -120,6 +121,30 @@ fn serve(_robot: &str) -> anyhow::Result<Exit> {
     anyhow::bail!("this program contains no emulated devices")
 }
 
+fn this_program() -> anyhow::Result<Command> {
+    let path = std::env::current_exe().context("the path of this program is unknown")?;
+    Ok(Command::new(path))
+}
+
+fn serve_command(kind: ArmKind, address: &str) -> anyhow::Result<Command> {
+    let mut command = this_program()?;
+    let robot = format!("{}={address}", kind.name());
+    command.args(["bench", "steering", "--serve", &robot]);
+    Ok(command)
+}
+
+fn run_command(rig: &Path, out: &Path) -> anyhow::Result<Command> {
+    let mut command = this_program()?;
+    command
+        .arg("run")
+        .arg(rig)
+        .args(["--sim", "--enable-motion", "--json"]);
+    command
+        .args(["--listen", "127.0.0.1:0", "--when-done", "exit", "--out"])
+        .arg(out);
+    Ok(command)
+}
+
 impl Args {
     fn options(&self) -> anyhow::Result<SteeringOptions> {
         let arms = if self.arms.is_empty() {
@@ -149,7 +174,10 @@ impl Args {
                     n_views: self.views,
                     round_trip: Duration::from_secs_f64(1e-3 * self.views_round_trip),
                 }),
-            program: Some(std::env::current_exe().context("the path of this program is unknown")?),
+            processes: Some(Processes {
+                serve: serve_command,
+                run: run_command,
+            }),
             out: self.out.clone(),
         })
     }

@@ -30,8 +30,15 @@ const HEADSET: &str = include_str!("headset_script.js");
 /// Layers as on a real headset, drawn into the canvas of the emulation after each frame.
 const LAYERS: &str = include_str!("headset_layers.js");
 
-/// IWER as one script; `None` if it is not installed.
+/// Runs these tests if it is "demand". Without a GPU, they draw two eyes for many minutes.
+const DEMAND_VARIABLE: &str = "FIELDRIG_HEADSET_TESTS";
+
+/// IWER as one script; `None` if it is not installed, or if these tests are not demanded.
 pub(crate) fn iwer() -> Option<String> {
+    if std::env::var(DEMAND_VARIABLE).as_deref() != Ok("demand") {
+        test_support::skip(format!("{DEMAND_VARIABLE} is not set to demand"));
+        return None;
+    }
     let path =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("web/node_modules/iwer/build/iwer.min.js");
     let script = std::fs::read_to_string(path).ok();

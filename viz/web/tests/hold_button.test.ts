@@ -110,6 +110,6 @@ test("the list of a select releases keys, a menu that the page prevents does not
 function jogKeys(): (Jog | null)[] {
   const jogs: (Jog | null)[] = [];
   const commander = { hasControl: true, setJog: (_source: string, jog: Jog | null) => jogs.push(jog) };
-  new JogKeys(commander as unknown as Commander, () => undefined);
+  new JogKeys(commander as unknown as Commander, () => undefined, () => undefined);
   return jogs;
 }

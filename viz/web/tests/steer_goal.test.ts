@@ -80,7 +80,7 @@ test("each look of the ghost has a distinct pattern, and collisions precede near
   assert.equal(new Set(patterns).size, patterns.length);
   const looks = (["reachable", "near", "self-collision", "never seen", "unreachable", "limits"] as const).map(lookOfVerdict);
   assert.deepEqual(looks, ["reachable", "near", "collision", "collision", "unreachable", "unreachable"]);
-  const limit = { speed_scale: 0.5, text: "", place: null };
+  const limit = { part: "arm", speed_scale: 0.5, text: "", place: null } as const;
   const slowed = { ...limit, link: "clearance", effect: "slowed" } as const;
   const refused = { ...limit, link: "self-collision", effect: "refused" } as const;
   assert.equal(lookOfLimits([]), "reachable");
@@ -115,7 +115,7 @@ test("texts say who has control, and how the arm moves and why", () => {
   assert.equal(leaseText(other, CLIENT), "Operator 3 has control for at least 4 s more. Control is offered to you");
   assert.match(modeText("servo", 32.4, 120, false), /^Servo.*32 ms, limit 120 ms/);
   assert.match(modeText("preview", null, 120, true), /^Preview, then go as chosen.*not measured/);
-  const limit = { part: "arm", link: "clearance", speed_scale: 0.25, text: "3 cm to a surface", place: null };
+  const limit = { part: "arm", link: "clearance", speed_scale: 0.25, text: "3 cm to a surface", place: null } as const;
   assert.equal(limitText({ ...limit, effect: "slowed" }), "Slowed to 25 %: 3 cm to a surface");
   assert.equal(limitText({ ...limit, effect: "refused" }), "Refused: 3 cm to a surface");
   assert.equal(verdictText("unreachable", ""), "The goal is out of reach");

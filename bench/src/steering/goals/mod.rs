@@ -173,15 +173,31 @@ pub(super) fn table(rows: &[GoalRow]) -> Table {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use steering::{Link, Reason};
 
     #[test]
-    fn goals_behind_obstacles_touch_nothing_and_free_goals_are_reached() {
-        let rows = measure(GoalScene::Table, 6).expect("a scene");
-        let [obstacles, free] = &rows;
-        assert_eq!((obstacles.n_goals, free.n_goals), (6, 6));
-        assert_eq!((obstacles.n_contacts, free.n_contacts), (0, 0), "{rows:?}");
-        assert_eq!(obstacles.n_without_place, 0, "{obstacles:?}");
-        assert!(obstacles.n_refused_with_place > 0, "{obstacles:?}");
-        assert!(free.n_reached >= 5, "{free:?}");
+    fn ways_are_counted_by_how_they_end() {
+        let near = Reason::Near {
+            part: "hand".to_owned(),
+            distance_m: 0.02,
+            age_secs: 0.0,
+            place: [0.1, 0.2, 0.3],
+        };
+        let mut row = GoalRow::new(GoalScene::Table, GoalKind::Obstacle);
+        let reached = Attempt::ended(true, 0, None);
+        let touched = Attempt::ended(true, 2, None);
+        let refused = Attempt::ended(false, 0, Some((Link::Clearance, near)));
+        let stuck = Attempt::ended(false, 0, None);
+        for attempt in [&reached, &touched, &refused, &stuck] {
+            row.add(attempt);
+        }
+        let mut both = GoalRow::new(GoalScene::Table, GoalKind::Obstacle);
+        both.merge(&row);
+        both.merge(&row);
+        assert_eq!((both.n_goals, both.n_reached, both.n_contacts), (8, 4, 4));
+        assert_eq!((both.n_refused_with_place, both.n_without_place), (2, 0));
+        let reasons = both.reasons.iter().map(|(name, n)| (*name, *n));
+        let expected = [("near a surface", 2), ("not refused", 2)];
+        assert_eq!(reasons.collect::<Vec<_>>(), expected);
     }
 }

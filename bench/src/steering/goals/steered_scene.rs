@@ -58,6 +58,21 @@ pub(super) struct Attempt {
 }
 
 impl Attempt {
+    /// * `refusal`: the link that refused to move the arm further, and its reason.
+    pub(super) fn ended(
+        is_reached: bool,
+        n_contacts: u64,
+        refusal: Option<(Link, Reason)>,
+    ) -> Self {
+        let (link, refusal) = refusal.unzip();
+        Self {
+            is_reached,
+            n_contacts,
+            refusal,
+            link,
+        }
+    }
+
     /// The name of what ended the way.
     pub(super) fn reason_name(&self) -> &'static str {
         match &self.refusal {
@@ -196,12 +211,11 @@ impl SteeredScene {
         let tip = self.chain.forward(&self.position()?)?;
         let gap = Target::pose(goal).gap(&tip);
         self.release()?;
-        Ok(Attempt {
-            is_reached: gap.distance_m <= REACHED_M && gap.angle_rad <= REACHED_RAD,
-            n_contacts: self.opened.n_contacts() - n_before,
-            link: refused.as_ref().map(|limit| limit.link),
-            refusal: refused.map(|limit| limit.reason),
-        })
+        Ok(Attempt::ended(
+            gap.distance_m <= REACHED_M && gap.angle_rad <= REACHED_RAD,
+            self.opened.n_contacts() - n_before,
+            refused.map(|limit| (limit.link, limit.reason)),
+        ))
     }
 
     fn choose(&mut self, kind: GoalKind) -> Result<Transform> {

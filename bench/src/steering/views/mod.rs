@@ -24,7 +24,11 @@ use run_process::RunProcess;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
+
+/// Command of the run, see [`Processes::run`](super::Processes::run).
+type RunCommand = fn(rig: &Path, out: &Path) -> Result<Command>;
 
 /// Number of keyframes of the scan. A longer scan would leave no view that it never had.
 const N_SCANNED: u64 = 12;
@@ -94,9 +98,13 @@ pub struct ViewRow {
 /// # Errors
 ///
 /// If the run cannot be started or steered.
-pub(super) fn measure(options: &ViewOptions, program: &Path, out: &Path) -> Result<Vec<ViewRow>> {
+pub(super) fn measure(
+    options: &ViewOptions,
+    command: RunCommand,
+    out: &Path,
+) -> Result<Vec<ViewRow>> {
     let rig = Rig::load(&options.rig, &[]).context("the rig file of the views")?;
-    let mut steered = SteeredViews::start(options, &rig, program, out)?;
+    let mut steered = SteeredViews::start(options, &rig, command, out)?;
     let mut rows = Vec::new();
     for view in 0..options.n_views {
         let row = steered.try_view()?;
@@ -129,8 +137,8 @@ struct NewView {
 }
 
 impl SteeredViews {
-    fn start(options: &ViewOptions, rig: &Rig, program: &Path, out: &Path) -> Result<Self> {
-        let run = RunProcess::start(program, &options.rig, out)?;
+    fn start(options: &ViewOptions, rig: &Rig, command: RunCommand, out: &Path) -> Result<Self> {
+        let run = RunProcess::start(command(&options.rig, out)?)?;
         let page = PageClient::connect(run.server())?;
         page.wait_for_keyframes(N_SCANNED, MAX_SCAN)?;
         let client = SteeringClient::connect(run.server(), 1)?;

@@ -4,7 +4,6 @@ use anyhow::{Context, Result, bail};
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
-use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 /// The run. Dropping it kills the process.
@@ -19,23 +18,12 @@ impl RunProcess {
     /// # Errors
     ///
     /// If it does not start.
-    pub(super) fn start(program: &Path, rig: &Path, out: &Path) -> Result<Self> {
-        let mut child = Command::new(program)
-            .arg("run")
-            .arg(rig)
-            .args([
-                "--sim",
-                "--enable-motion",
-                "--json",
-                "--listen",
-                "127.0.0.1:0",
-            ])
-            .args(["--when-done", "exit", "--out"])
-            .arg(out)
+    pub(super) fn start(mut command: Command) -> Result<Self> {
+        let mut child = command
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()
-            .with_context(|| format!("cannot start {}", program.display()))?;
+            .context("cannot start the run")?;
         let stdout = child.stdout.take().context("the run has no output")?;
         let mut run = Self {
             child,

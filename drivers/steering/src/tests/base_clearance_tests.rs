@@ -257,7 +257,7 @@ fn nothing_is_touched_and_no_unseen_space_entered_whatever_the_operator_does() {
         let mut random = Random::new(seed);
         let mut sim = Sim::new(config());
         sim.room.seen_m.set(1.6);
-        let mut travelled_m = 0.0;
+        let mut traveled_m = 0.0;
         let mut intent = velocity(0.5, 0.0, 0.0);
         for step in 0..2500 {
             if step % 120 == 0 {
@@ -278,7 +278,7 @@ fn nothing_is_touched_and_no_unseen_space_entered_whatever_the_operator_does() {
             }
             let before = sim.pose;
             sim.drive(1, &intent);
-            travelled_m += (sim.pose.x_m - before.x_m).hypot(sim.pose.y_m - before.y_m);
+            traveled_m += (sim.pose.x_m - before.x_m).hypot(sim.pose.y_m - before.y_m);
             let gap_m = sim.gap_m();
             assert!(
                 gap_m > 0.0,
@@ -286,7 +286,7 @@ fn nothing_is_touched_and_no_unseen_space_entered_whatever_the_operator_does() {
                 sim.pose
             );
         }
-        assert!(travelled_m > 2.0, "seed {seed}: {travelled_m}");
+        assert!(traveled_m > 2.0, "seed {seed}: {traveled_m}");
     }
 }
 
