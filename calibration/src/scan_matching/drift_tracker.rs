@@ -27,16 +27,6 @@ pub struct DriftTracker {
     last: Option<Transform>,
 }
 
-/// What a scan showed.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ScanOutcome {
-    /// The scan was added to the map without a comparison, because it is the first one, or because
-    /// no earlier scan has seen the same surfaces.
-    NewPlace,
-    /// The scan was matched, moved and added.
-    Matched(ScanMatch),
-}
-
 impl Default for DriftTracker {
     fn default() -> Self {
         Self {
@@ -48,11 +38,16 @@ impl Default for DriftTracker {
 }
 
 impl DriftTracker {
-    /// Adds a scan.
+    /// Adds a scan, and returns how it was matched. `None` if it was added without a comparison,
+    /// because it is the first one, or because no earlier scan has seen the same surfaces.
     ///
     /// * `points`: in the world frame, according to odometry and the correction so far, meters.
     /// * `world_from_base`: pose of the base according to the same correction.
-    pub fn add(&mut self, points: &[Point3<f64>], world_from_base: &Transform) -> ScanOutcome {
+    pub fn add(
+        &mut self,
+        points: &[Point3<f64>],
+        world_from_base: &Transform,
+    ) -> Option<ScanMatch> {
         let base = Point3::from(world_from_base.translation.vector);
         if let Some(last) = self.last {
             self.covariance = carried(&self.covariance, &last, world_from_base)
@@ -64,13 +59,13 @@ impl DriftTracker {
         let Some(found) = found else {
             self.map.add(points);
             self.last = Some(*world_from_base);
-            return ScanOutcome::NewPlace;
+            return None;
         };
         let moved: Vec<Point3<f64>> = points.iter().map(|point| found.motion * point).collect();
         self.map.add(&moved);
         self.covariance = found.covariance;
         self.last = Some(found.motion * world_from_base);
-        ScanOutcome::Matched(found)
+        Some(found)
     }
 
     /// Forgets the map and the covariance, because the source has restarted.

@@ -2,7 +2,7 @@
 //!
 //! Odometry drifts, but the walls of a room do not. Each scan is moved so that its points lie on
 //! the planes of a [`SurfaceMap`] (point to plane, Chen and Medioni 1992; planes in cells as in
-//! VoxelMap, Yuan et al. 2022). The pose from odometry is the prior, with a covariance that grows
+//! `VoxelMap`, Yuan et al. 2022). The pose from odometry is the prior, with a covariance that grows
 //! with the distance traveled. A direction that the surfaces do not determine, such as that along a
 //! corridor, therefore follows odometry.
 
@@ -12,7 +12,7 @@ mod surface_map;
 #[cfg(test)]
 mod tests;
 
-pub use drift_tracker::{DriftTracker, ScanOutcome};
+pub use drift_tracker::DriftTracker;
 pub use surface_map::SurfaceMap;
 
 use kinematics::Transform;

@@ -2,7 +2,7 @@
 
 use super::camera_motion::Motion;
 use crate::pose_distance::PoseDistance;
-use calibration::{DriftTracker, ScanOutcome};
+use calibration::DriftTracker;
 use keyframe::RangePoints;
 use kinematics::{Stamp, Transform, transform};
 use nalgebra::Point3;
@@ -161,7 +161,7 @@ impl ScanCorrection {
             .iter()
             .map(|point| Point3::from(*point).cast())
             .collect();
-        let ScanOutcome::Matched(found) = self.tracker.add(&points, &world_from_base) else {
+        let Some(found) = self.tracker.add(&points, &world_from_base) else {
             self.report.n_unmatched += 1;
             return scan;
         };
