@@ -358,7 +358,7 @@ fn index(value: &Value) -> Option<usize> {
 }
 
 /// Header and payload of a binary message.
-fn split(message: &[u8]) -> Result<(Value, &[u8])> {
+pub(crate) fn split(message: &[u8]) -> Result<(Value, &[u8])> {
     let header = message.split_first_chunk().and_then(|(length, rest)| {
         rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?)
     });

@@ -68,7 +68,7 @@ fn read_limited(path: &Path) -> std::io::Result<String> {
 
 /// Checks the text of a file. The error is the reason why it is no workspace.
 fn check(text: &str) -> Result<(), String> {
-    /// What tells other files and versions apart. These come first, because each of their keys
+    /// The keys that identify a workspace file and its version. These come first, because each of their keys
     /// would be unknown.
     #[derive(Deserialize)]
     struct Head {

@@ -74,7 +74,7 @@ impl Cell {
         }
     }
 
-    /// The plane of the points, if they lie on one. `center`: center of the cell.
+    /// The plane of the points, if they lie on one.
     pub(super) fn plane(&self) -> Option<&Plane> {
         self.plane.as_ref()
     }

@@ -67,11 +67,6 @@ impl DriftTracker {
         self.last = Some(found.motion * world_from_base);
         Some(found)
     }
-
-    /// Forgets the map and the covariance, because the source has restarted.
-    pub fn restart(&mut self) {
-        *self = Self::default();
-    }
 }
 
 /// Covariance of the correction at another position of the base. A wrong rotation about the first

@@ -13,15 +13,12 @@ mod surface_map;
 mod tests;
 
 pub use drift_tracker::DriftTracker;
-pub use surface_map::SurfaceMap;
 
+use crate::rigid_transform;
 use kinematics::Transform;
-use nalgebra::{
-    Cholesky, Isometry3, Matrix3, Matrix6, Point3, SymmetricEigen, Translation3, UnitQuaternion,
-    Vector3, Vector6,
-};
+use nalgebra::{Cholesky, Matrix3, Matrix6, Point3, SymmetricEigen, Vector3, Vector6};
 use rustc_hash::FxHashMap;
-use surface_map::CellId;
+use surface_map::{CellId, SurfaceMap};
 
 /// Maximum number of points of a scan that are compared. More points would not be independent,
 /// because they lie on the same planes.
@@ -77,8 +74,7 @@ struct Match {
 /// * `prior`: covariance of the motion that is still to be found, as in [`ScanMatch::covariance`].
 ///
 /// Returns `None` if too few points lie on known planes, or if the search does not converge.
-#[must_use]
-pub fn match_scan(
+fn match_scan(
     map: &SurfaceMap,
     points: &[Point3<f64>],
     base: &Point3<f64>,
@@ -224,8 +220,7 @@ fn parameters(motion: &Transform, base: &Point3<f64>) -> Vector6<f64> {
 }
 
 fn from_parameters(parameters: &Vector6<f64>, base: &Point3<f64>) -> Transform {
-    let rotation = UnitQuaternion::from_scaled_axis(parameters.fixed_rows::<3>(3).into_owned());
-    let translation = parameters.fixed_rows::<3>(0).into_owned();
-    let about = base.coords - rotation * base.coords;
-    Isometry3::from_parts(Translation3::from(translation + about), rotation)
+    let [translation, rotation] = [0, 3].map(|row| parameters.fixed_rows::<3>(row).into_owned());
+    let about_base = Transform::from(base.coords);
+    about_base * rigid_transform(rotation, translation) * about_base.inverse()
 }

@@ -16,7 +16,7 @@ const MAX_OFFSET: f64 = 0.3;
 
 /// Surfaces that were seen so far: planes in the cells of several grids.
 #[derive(Debug)]
-pub struct SurfaceMap {
+pub(super) struct SurfaceMap {
     grids: Vec<Grid>,
 }
 
@@ -76,13 +76,12 @@ impl Grid {
 
 impl SurfaceMap {
     /// Whether nothing was added yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
+    pub(super) fn is_empty(&self) -> bool {
         self.grids.iter().all(|grid| grid.cells.is_empty())
     }
 
     /// Adds points in the world frame, meters.
-    pub fn add(&mut self, points: &[Point3<f64>]) {
+    pub(super) fn add(&mut self, points: &[Point3<f64>]) {
         for grid in &mut self.grids {
             let mut changed = Vec::new();
             for point in points {

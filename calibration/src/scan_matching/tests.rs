@@ -1,5 +1,5 @@
 use super::*;
-use nalgebra::UnitQuaternion;
+use nalgebra::{Translation3, UnitQuaternion};
 use numbers::random::Random;
 
 /// Noise of a scanner, meters.

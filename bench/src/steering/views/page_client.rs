@@ -1,10 +1,10 @@
 //! A client of `/ws` that asks for pictures and photographs, as an open page does.
 
+use crate::viewer::split;
 use crate::websocket::{self, BINARY, CLOSE, PING, PONG, TEXT};
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use image::RgbImage;
-use kinematics::Transform;
-use nalgebra::{Matrix4, Translation3, UnitQuaternion};
+use kinematics::{Transform, transform};
 use parking_lot::{Condvar, Mutex};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -343,30 +343,13 @@ fn listed_keyframe(listed: &Value) -> Option<ListedKeyframe> {
 
 /// A pose from the 16 numbers of a matrix, row by row.
 fn transform_of(numbers: &[f64]) -> Option<Transform> {
-    if numbers.len() != 16 {
-        return None;
-    }
-    let matrix = Matrix4::from_row_slice(numbers);
-    let rotation = matrix.fixed_view::<3, 3>(0, 0).into_owned();
-    Some(Transform::from_parts(
-        Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]),
-        UnitQuaternion::from_matrix(&rotation),
-    ))
-}
-
-/// Header and payload of a binary message.
-fn split(message: &[u8]) -> Result<(Value, &[u8])> {
-    let header = message.split_first_chunk().and_then(|(length, rest)| {
-        rest.split_at_checked(usize::try_from(u32::from_le_bytes(*length)).ok()?)
-    });
-    let (header, payload) = header
-        .ok_or_else(|| anyhow!("a binary message of {} bytes without header", message.len()))?;
-    Ok((serde_json::from_slice(header)?, payload))
+    transform::from_rows(numbers.try_into().ok()?).ok()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::{Translation3, UnitQuaternion};
 
     #[test]
     fn poses_are_read_row_by_row() {

@@ -63,7 +63,7 @@ impl RobotWatch {
         }
     }
 
-    /// Pose of the base in the map at a time, as far as it is known.
+    /// Pose of the base in the map at a time; `None` if it is unknown.
     pub(in crate::steering) fn world_from_base(&self, at: Stamp) -> Option<Transform> {
         let newest = self.newest.lock();
         let delivered = || newest.delivered_poses.at(at);

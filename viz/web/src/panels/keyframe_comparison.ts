@@ -88,7 +88,7 @@ export class PoseRenderer {
     }
   }
 
-  /** Compares a live image with the model as it is now. */
+  /** Compares a live image with the current model. */
   async compareLive({ header, jpeg }: PosedImage): Promise<Comparison> {
     const [photo, render] = await Promise.all([decodeLive(jpeg), this.render(header, header.size_px)]);
     return comparison(photo, render);
