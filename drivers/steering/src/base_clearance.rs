@@ -12,6 +12,9 @@ use crate::reason::Reason;
 use drivers::base_motion::{BaseLimits, BaseVelocity};
 use serde::{Deserialize, Serialize};
 
+/// What the map of free space returns for places in the world, meters; `None` where nothing was seen.
+type Readings<'a> = dyn FnMut(&[[f64; 3]]) -> Vec<Option<Seen>> + 'a;
+
 /// Time from a decision until the base follows it, seconds: the transmission of the command, a cycle
 /// of the thread of the base, and the reaction of its controller. With the age of the pose, this is
 /// the time during which the base does not slow down.
@@ -155,11 +158,7 @@ impl BaseClearance {
     /// The room along a way.
     ///
     /// * `readings`: what is known about points in the frame of the base link.
-    pub(crate) fn room(
-        &self,
-        way: &Way<'_>,
-        readings: &mut dyn FnMut(&[[f64; 3]]) -> Vec<Option<Seen>>,
-    ) -> Room {
+    pub(crate) fn room(&self, way: &Way<'_>, readings: &mut Readings<'_>) -> Room {
         let mut room = Room::default();
         let speed_m_s = self.speed_m_s(way.velocity);
         if speed_m_s <= 0.0 {
@@ -317,11 +316,7 @@ impl BaseClearance {
         self.points.iter().map(place).collect()
     }
 
-    fn known(
-        &self,
-        moved: &[[f64; 3]],
-        readings: &mut dyn FnMut(&[[f64; 3]]) -> Vec<Option<Seen>>,
-    ) -> Vec<Known> {
+    fn known(&self, moved: &[[f64; 3]], readings: &mut Readings<'_>) -> Vec<Known> {
         let read = readings(moved);
         let known = |(ix, point): (usize, &[f64; 3])| {
             let seen = read.get(ix).copied().flatten();
