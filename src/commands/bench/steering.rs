@@ -108,7 +108,7 @@ fn serve(robot: &str) -> anyhow::Result<Exit> {
     let kind = ArmKind::ALL.into_iter().find(|kind| kind.name() == name);
     let kind = kind.with_context(|| format!("no robot is named {name:?}"))?;
     bench::steering::serve_robot(kind, address, |server| {
-        print::line(&server.to_string())?;
+        print::line(server.to_string())?;
         let mut input = Vec::new();
         std::io::Read::read_to_end(&mut std::io::stdin(), &mut input)?;
         Ok(())

@@ -288,7 +288,9 @@ impl Robot {
         let base = self.world_from_base.translation.vector;
         let layer = |height_m: f64| {
             let up = Vector3::new(0.0, 0.0, height_m);
-            floor((grid.in_voxels(&(base + up)).z.max(0.0) + 0.5) as f32)
+            #[expect(clippy::cast_possible_truncation, reason = "a layer is a small number")]
+            let layer = (grid.in_voxels(&(base + up)).z.max(0.0) + 0.5) as f32;
+            floor(layer)
         };
         Some(self.heights_m?.map(layer))
     }
