@@ -2,6 +2,7 @@
 //! of a few tiny photos.
 
 use crate::command::assert_one_error;
+#[cfg(feature = "sim")]
 use crate::small_rig::{self, Pace};
 use image::RgbImage;
 use serde_json::{Value, json};
@@ -151,6 +152,7 @@ fn steering_bench_reports_each_fault_and_writes_a_chart() {
     assert_fails_with(folder.path(), &unknown, 2, &["--faults", "weather"]);
 }
 
+#[cfg(feature = "sim")]
 #[test]
 fn steering_bench_kills_the_program_that_drives_a_base() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -181,6 +183,7 @@ fn steering_bench_kills_the_program_that_drives_a_base() {
     }
 }
 
+#[cfg(feature = "sim")]
 #[test]
 fn steering_bench_steers_a_run_to_views_that_its_scan_never_had() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -52,6 +52,7 @@ mod small_rig;
 mod steered_base;
 #[cfg(feature = "sim")]
 mod steering;
+#[cfg(feature = "sim")]
 mod steering_client;
 #[cfg(feature = "sim")]
 mod terminal;

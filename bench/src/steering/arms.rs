@@ -22,6 +22,7 @@ use kinematics::Chain;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
+#[cfg(all(feature = "sim", target_os = "linux"))]
 use std::time::Duration;
 
 /// Acceleration and jerk of braking, as a factor of the limits of motions, as in runs.

@@ -22,6 +22,7 @@ pub(super) struct Braking {
     pub(super) predicted_secs: Option<f64>,
 }
 
+#[cfg(all(feature = "sim", target_os = "linux"))]
 impl Braking {
     /// A brake by other rules than the limits.
     pub(super) fn without_prediction(self) -> Self {

@@ -58,7 +58,7 @@ test("texts are cut with an ellipsis and wrapped at words", () => {
   assert.equal(cut("short", 10, widthOf), "short");
   assert.equal(cut("rather long", 8, widthOf), "rather…");
   assert.deepEqual(wrapped("one two three forest", 9, 3, widthOf), ["one two", "three", "forest"]);
-  assert.deepEqual(wrapped("one two three forest", 9, 2, widthOf), ["one two", "three fo…"]);
+  assert.deepEqual(wrapped("one two three forest", 10, 2, widthOf), ["one two", "three for…"]);
   assert.deepEqual(wrapped("", 9, 2, widthOf), []);
 });
 

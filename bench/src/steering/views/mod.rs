@@ -58,7 +58,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(500);
 /// Number of samples with an open switch before a grip.
 const N_OPEN_SAMPLES: u32 = 5;
 
-/// Options of [`measure`].
+/// The run, and the views to which an operator steers its camera.
 #[derive(Clone, Debug)]
 pub struct ViewOptions {
     /// The rig file, which is simulated.
