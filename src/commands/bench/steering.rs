@@ -121,27 +121,28 @@ fn serve(_robot: &str) -> anyhow::Result<Exit> {
     anyhow::bail!("this program contains no emulated devices")
 }
 
-fn this_program() -> anyhow::Result<Command> {
+/// The run that `--views` steers, without its rig file and its folder.
+const STEERED_RUN: &str =
+    "fieldrig run --sim --enable-motion --json --listen 127.0.0.1:0 --when-done exit";
+
+/// This program with the arguments of a command line, which are separated by single spaces.
+fn this_program(command_line: &str) -> anyhow::Result<Command> {
     let path = std::env::current_exe().context("the path of this program is unknown")?;
-    Ok(Command::new(path))
+    let mut command = Command::new(path);
+    command.args(command_line.split(' ').skip(1));
+    Ok(command)
 }
 
 fn serve_command(kind: ArmKind, address: &str) -> anyhow::Result<Command> {
-    let mut command = this_program()?;
+    let mut command = this_program("fieldrig bench steering")?;
     let robot = format!("{}={address}", kind.name());
-    command.args(["bench", "steering", "--serve", &robot]);
+    command.args(["--serve", &robot]);
     Ok(command)
 }
 
 fn run_command(rig: &Path, out: &Path) -> anyhow::Result<Command> {
-    let mut command = this_program()?;
-    command
-        .arg("run")
-        .arg(rig)
-        .args(["--sim", "--enable-motion", "--json"]);
-    command
-        .args(["--listen", "127.0.0.1:0", "--when-done", "exit", "--out"])
-        .arg(out);
+    let mut command = this_program(STEERED_RUN)?;
+    command.arg(rig).arg("--out").arg(out);
     Ok(command)
 }
 

@@ -144,7 +144,7 @@ export class Connection {
       this.disconnect();
     } else if (this.state === "lost") {
       this.report();
-    } else if (silence > SILENT_MILLIS) {
+    } else if (this.state !== "connecting" && silence > SILENT_MILLIS) {
       this.state = "silent";
       this.report();
     }
