@@ -130,6 +130,7 @@ const ONLY_PARSED: [(&str, &[&str]); 10] = [
             "run rigs/mobile-base.toml --sim --enable-motion",
             "run rigs/static-arm.toml --sim",
             "train scan.mcap",
+            "train scene.mcap",
             "render MODEL --camera-path camera_path.json --out renders",
         ],
     ),

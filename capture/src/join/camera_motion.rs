@@ -1,6 +1,6 @@
 //! Camera poses and velocities at a stamp, and the resulting image motion.
 
-use super::drift::{Corrections, JumpRemoval};
+use super::base_corrections::{Corrections, JumpRemoval};
 use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
 use anyhow::Context;

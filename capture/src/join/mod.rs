@@ -5,6 +5,7 @@
 
 mod accept;
 mod assemble;
+mod base_corrections;
 mod camera_motion;
 mod change;
 mod drift;

@@ -1,6 +1,5 @@
 //! Passes the data of the devices of a run to the steering of a robot, and to viewers.
 
-use super::scene_clearance::SceneClearance;
 use crate::viewers::Viewers;
 use capture::InputObserver;
 use keyframe::Keyframe;
@@ -17,20 +16,6 @@ pub(super) trait RobotObserver: Send + Sync {
 
     /// Receives a scan of a range scanner.
     fn observe_range_scan(&self, _scan: &RangeScan) {}
-}
-
-impl RobotObserver for SceneClearance {
-    fn observe_robot(&self, state: &RobotState) {
-        Self::observe_robot(self, state); // The function of the map itself.
-    }
-
-    fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
-        Self::observe_keyframe(self, keyframe);
-    }
-
-    fn observe_range_scan(&self, scan: &RangeScan) {
-        Self::observe_range_scan(self, scan);
-    }
 }
 
 /// An observer of a run's input whose robot is steered.

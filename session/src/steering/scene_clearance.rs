@@ -7,6 +7,7 @@
 //! a person guides it, or a simulated arm is on its tour.
 
 use super::base::RobotWatch;
+use super::observer::RobotObserver;
 use super::robot::ChainAndBody;
 use super::undrawn::UndrawnKeyframes;
 use capture::config::Rig;
@@ -415,6 +416,20 @@ impl Clearance for SceneClearance {
 
     fn failure(&self) -> Option<String> {
         self.map.failure()
+    }
+}
+
+impl RobotObserver for SceneClearance {
+    fn observe_robot(&self, state: &RobotState) {
+        Self::observe_robot(self, state); // The function of the map itself.
+    }
+
+    fn observe_keyframe(&self, keyframe: &Arc<Keyframe>) {
+        Self::observe_keyframe(self, keyframe);
+    }
+
+    fn observe_range_scan(&self, scan: &RangeScan) {
+        Self::observe_range_scan(self, scan);
     }
 }
 
