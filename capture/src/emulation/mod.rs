@@ -549,6 +549,8 @@ mod tests {
                 .expect("the rig file is bundled");
             plain.arm = wire.arm.clone();
             plain.base.driver = wire.base.driver;
+            // Poses of the base come from another program, which moves it.
+            plain.base.motion = wire.base.motion.clone();
             for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
                 camera.driver = on_wire.driver;
                 camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();

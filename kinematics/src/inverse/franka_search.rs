@@ -7,7 +7,7 @@ use super::franka::{Branch, Forearm, FrankaArm, SevenFrame, opposite};
 
 /// Number of intervals in the range of the last joint at the first level. About 98 % of the
 /// reachable poses of a Panda have a solution at one of their ends.
-const N_INTERVALS: u32 = 14;
+const N_INTERVALS: u32 = 16;
 /// Number of levels. Each level halves the intervals of the previous level. At the last level,
 /// values of the last joint are 0.013 rad apart. The few poses without a solution at these values
 /// are left to least squares.

@@ -11,9 +11,12 @@ use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::FRAC_PI_2;
 use std::sync::Arc;
 
-/// Pixels per side of an image. Their angle of 1.8 degrees is close to the angle between the rings
-/// of small scanners.
-const SIDE_PX: u32 = 64;
+/// Focal length of an image, pixels. The angle of a pixel, 1.8 degrees, is close to the angle
+/// between the rings of small scanners.
+const FOCAL_PX: f64 = 32.0;
+/// Pixels per side of an image. The images overlap by 3.4 degrees on each side, because the map
+/// frees no space at the border of an image.
+const SIDE_PX: u32 = 72;
 /// Largest number of pixels between two rings. The rings of a scanner with 16 rings over 30 degrees
 /// are 1.2 pixels apart.
 const MAX_GAP_PX: usize = 2;
@@ -38,13 +41,12 @@ pub fn images_of_scan(
         .map(|ix| {
             let world_from_camera = world_from_scanner * scanner_from_camera(ix);
             let depth_m = draw(&world_from_camera, points_in_world);
-            let focal_px = 0.5 * f64::from(SIDE_PX);
             DepthImage {
                 camera: format!("{scanner} {ix}").into(),
                 stamp,
                 size_px: [SIDE_PX; 2],
-                focal_px: [focal_px; 2],
-                principal_px: [focal_px; 2],
+                focal_px: [FOCAL_PX; 2],
+                principal_px: [0.5 * f64::from(SIDE_PX); 2],
                 depth_m: Arc::from(depth_m),
                 world_from_camera,
                 posture: posture.clone(),
@@ -70,8 +72,8 @@ fn draw(world_from_camera: &Transform, points_in_world: &[[f64; 3]]) -> Vec<f32>
     for point in points_in_world {
         let at = camera_from_world * Point3::from(*point);
         let (Some(column), Some(row)) = (
-            pixel(half + half * at.x / at.z),
-            pixel(half + half * at.y / at.z),
+            pixel(half + FOCAL_PX * at.x / at.z),
+            pixel(half + FOCAL_PX * at.y / at.z),
         ) else {
             continue;
         };
