@@ -64,6 +64,6 @@ pub use registration::{
     MovementDetector, PoseEstimate, PoseSigmas, ScalarEstimate, StationCorrection, Unobservable,
     align, candidates, compare_halves, register_station,
 };
-pub use scan_matching::{DriftTracker, ScanMatch};
+pub use scan_matching::{DriftTracker, RangeSensor, ScanMatch};
 pub use tag_check::{ContradictionCause, TagCheck, TagContradiction, TagObservation};
 pub use trial::{CameraRefinement, Candidate, MIN_VALIDATION_IMAGES, Trial, TrialReport};

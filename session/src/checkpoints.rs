@@ -123,6 +123,8 @@ pub struct Checkpoints {
     /// Storage of keyframes that exist nowhere else on disk; `None` if there is another copy.
     stored_keyframes: Option<StoredKeyframes>,
     last_keyframes: Instant,
+    /// Keyframes that must be stored again, because their poses were revised.
+    revised: Vec<Arc<Keyframe>>,
     writer: Option<WriterThread>,
     /// Whether this run has written a checkpoint.
     has_any: bool,
@@ -180,6 +182,7 @@ impl Checkpoints {
             last: Instant::now(),
             stored_keyframes: None,
             last_keyframes: Instant::now(),
+            revised: Vec::new(),
             writer: None,
             has_any: false,
             requested: None,
@@ -234,7 +237,8 @@ impl Checkpoints {
             // The last writer has finished. This logs its error, if there was one.
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
-            let thread = Task::start("keyframes", move || stored.add(&keyframes));
+            let revised = std::mem::take(&mut self.revised);
+            let thread = Task::start("keyframes", move || stored.add(&keyframes, &revised));
             self.writer = Some(WriterThread {
                 thread,
                 is_checkpoint: false,
@@ -242,6 +246,13 @@ impl Checkpoints {
             self.last_keyframes = Instant::now();
         }
         Ok(false)
+    }
+
+    /// Stores a keyframe again, because its pose was revised.
+    pub(crate) fn store_again(&mut self, keyframe: &Arc<Keyframe>) {
+        if self.stored_keyframes.is_some() {
+            self.revised.push(Arc::clone(keyframe));
+        }
     }
 
     /// Sets how many images did not become keyframes so far, by reason, for the next checkpoint.
@@ -296,6 +307,7 @@ impl Checkpoints {
                 .stored_keyframes
                 .clone()
                 .map(|stored| (stored, now.keyframes.to_vec())),
+            revised: std::mem::take(&mut self.revised),
         })
     }
 
@@ -391,6 +403,7 @@ pub struct CheckpointWrite {
     run_flags: RunFlags,
     path: PathBuf,
     keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
+    revised: Vec<Arc<Keyframe>>,
 }
 
 impl CheckpointWrite {
@@ -403,7 +416,7 @@ impl CheckpointWrite {
         // new checkpoint are written before the checkpoint. The keyframes of the old checkpoint
         // exist until it is replaced.
         if let Some((stored, keyframes)) = &self.keyframes {
-            stored.add(keyframes)?;
+            stored.add(keyframes, &self.revised)?;
         }
         Checkpoint {
             seconds: self.seconds,

@@ -213,6 +213,11 @@ impl Pushed {
         }
     }
 
+    /// Camera and stamp of the keyframe, nanoseconds.
+    pub(crate) fn key(&self) -> (&str, i64) {
+        (&self.camera, self.stamp_nanos)
+    }
+
     /// The split of the keyframe. It is always `Some` in a log that was read, because the parser
     /// checks it.
     pub(crate) fn split(&self) -> Option<Split> {

@@ -182,6 +182,15 @@ impl Session {
         self.persistence.log_push(&mut self.method, keyframe)
     }
 
+    /// Replaces a keyframe with a version that has a more accurate pose.
+    pub fn revise(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
+        // After a GPU failure, the restored model gets the keyframes in the store, so the new
+        // version must be among them.
+        let removed = self.remove(&keyframe.camera, keyframe.stamp);
+        self.persistence.store_again(keyframe);
+        removed.and(self.push(keyframe))
+    }
+
     /// Adds a keyframe without pushing it to the model, such as one that a resumed model was
     /// already trained on.
     pub fn hold(&mut self, keyframe: &Arc<Keyframe>) {

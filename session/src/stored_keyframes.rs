@@ -78,14 +78,19 @@ impl StoredKeyframes {
         }
     }
 
-    /// Writes the keyframes that are not stored yet.
-    pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+    /// Writes the keyframes that are not stored yet, and those that are stored with an earlier pose.
+    pub fn add(
+        &self,
+        keyframes: &[Arc<Keyframe>],
+        revised: &[Arc<Keyframe>],
+    ) -> anyhow::Result<()> {
         std::fs::create_dir_all(&self.folder)
             .with_context(|| format!("cannot create {}", self.folder.display()))?;
         let existing = self.names()?;
         for keyframe in keyframes {
             let name = name_of(keyframe);
-            if !existing.contains(&name) {
+            let is_revised = revised.iter().any(|revised| Arc::ptr_eq(revised, keyframe));
+            if is_revised || !existing.contains(&name) {
                 to_checkpoint(keyframe)?.write(&self.folder.join(name))?;
             }
         }
@@ -406,8 +411,8 @@ mod tests {
             keyframe(20, false),
             keyframe(10_000_000_000, true),
         ];
-        stored.add(&all[..2]).expect("disk space");
-        stored.add(&all).expect("disk space");
+        stored.add(&all[..2], &[]).expect("disk space");
+        stored.add(&all, &[]).expect("disk space");
         let read = stored.read().expect("complete files");
         let in_order = [&all[1], &all[0], &all[2]];
         assert_eq!(read.len(), 3);
@@ -424,11 +429,29 @@ mod tests {
     }
 
     #[test]
+    fn revised_keyframe_replaces_the_stored_one() {
+        let run = tempfile::tempdir().expect("a folder");
+        let stored = StoredKeyframes::of_run(run.path());
+        let first = keyframe(1, true);
+        let correction = Transform::translation(0.001, 0.0, 0.0);
+        let revised = Arc::new(first.with_base_correction(&correction));
+        let pose = || stored.read().expect("complete files")[0].world_from_camera;
+        stored.add(&[Arc::clone(&first)], &[]).expect("disk space");
+        stored
+            .add(&[Arc::clone(&revised)], &[])
+            .expect("disk space");
+        assert_eq!(pose(), first.world_from_camera, "written only once");
+        let again = [Arc::clone(&revised)];
+        stored.add(&again, &again).expect("disk space");
+        assert_eq!(pose(), revised.world_from_camera);
+    }
+
+    #[test]
     fn single_keyframes_are_read_from_the_folder_only() {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
         assert!(!stored.exist());
-        stored.add(&[keyframe(7, true)]).expect("disk space");
+        stored.add(&[keyframe(7, true)], &[]).expect("disk space");
         assert!(stored.exist());
         let read = |camera: &str, stamp| stored.read_one(camera, Stamp(stamp));
         let found = read("wrist", 7).expect("a complete file").expect("stored");
@@ -449,7 +472,7 @@ mod tests {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
         assert!(stored.read().is_err(), "no folder yet");
-        stored.add(&[keyframe(1, true)]).expect("disk space");
+        stored.add(&[keyframe(1, true)], &[]).expect("disk space");
         let path = run
             .path()
             .join(KEYFRAMES)
@@ -464,7 +487,7 @@ mod tests {
             "{message}"
         );
         stored
-            .add(&[keyframe(2, true), keyframe(3, false)])
+            .add(&[keyframe(2, true), keyframe(3, false)], &[])
             .expect("disk space");
         std::fs::write(
             run.path()

@@ -20,7 +20,14 @@ pub(crate) struct KeyframeSignature {
     principal_px: [f64; 2],
     /// Translation, then rotation as x, y, z, w.
     world_from_camera: [f64; 7],
+    /// Correction of the base pose, in the same order; `None` without a moving base.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    map_from_odom: Option<[f64; 7]>,
 }
+
+/// Maximum difference between a pose that was recorded and the same pose computed from another
+/// correction of the base, meters or parts of a quaternion.
+const MAX_ROUNDING: f64 = 1e-9;
 
 impl KeyframeSignature {
     pub(crate) fn of(keyframe: &Keyframe) -> Self {
@@ -32,7 +39,26 @@ impl KeyframeSignature {
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
             world_from_camera: to_xyz_xyzw(&keyframe.world_from_camera),
+            map_from_odom: keyframe
+                .base
+                .as_ref()
+                .map(|base| to_xyz_xyzw(&base.map_from_odom)),
         }
+    }
+
+    /// The keyframe as it was recorded, if it differs only by a correction of the base. A run that
+    /// was killed may have stored a keyframe whose pose was revised since the last checkpoint.
+    fn with_recorded_base(&self, keyframe: &Keyframe) -> Option<Keyframe> {
+        let recorded = from_xyz_xyzw(self.map_from_odom?);
+        let now = keyframe.base.as_ref()?.map_from_odom;
+        let mut moved = keyframe.with_base_correction(&(recorded * now.inverse()));
+        let numbers = to_xyz_xyzw(&moved.world_from_camera);
+        let mut pairs = numbers.iter().zip(&self.world_from_camera);
+        if !pairs.all(|(a, b)| (a - b).abs() <= MAX_ROUNDING) {
+            return None;
+        }
+        moved.world_from_camera = from_xyz_xyzw(self.world_from_camera);
+        self.difference(&moved).is_none().then_some(moved)
     }
 
     /// A keyframe without pixels that stands for the recorded keyframe.
@@ -110,17 +136,21 @@ pub(crate) fn match_keyframes(
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
-    let mut found: Vec<Arc<Keyframe>> = Vec::new();
+    let mut found: Vec<(Arc<Keyframe>, &Arc<Keyframe>)> = Vec::new();
     let mut missing: Vec<Arc<Keyframe>> = Vec::new();
     for expected in expected {
         let Some(keyframe) = by_name.get(&(expected.camera.as_str(), expected.stamp_nanos)) else {
             missing.push(Arc::new(expected.placeholder()));
             continue;
         };
-        if let Some(difference) = expected.difference(keyframe) {
-            return Err(Error::CheckpointData(difference));
+        let Some(difference) = expected.difference(keyframe) else {
+            found.push((Arc::clone(keyframe), *keyframe));
+            continue;
+        };
+        match expected.with_recorded_base(keyframe) {
+            Some(recorded) => found.push((Arc::new(recorded), *keyframe)),
+            None => return Err(Error::CheckpointData(difference)),
         }
-        found.push(Arc::clone(keyframe));
     }
     // All missing keyframes are listed, so that the caller can continue without them in one
     // attempt.
@@ -131,12 +161,71 @@ pub(crate) fn match_keyframes(
     }
     // Keyframes are compared by address and not by name. The other keyframes include test
     // keyframes, and a second keyframe with the same camera and stamp must not be lost.
-    let is_matched =
-        |keyframe: &Arc<Keyframe>| found.iter().any(|matched| Arc::ptr_eq(matched, keyframe));
+    let is_matched = |keyframe: &Arc<Keyframe>| {
+        found
+            .iter()
+            .any(|(_, matched)| Arc::ptr_eq(matched, keyframe))
+    };
     let others = keyframes
         .iter()
         .filter(|keyframe| !is_matched(keyframe))
         .cloned()
         .collect();
-    Ok((found, others))
+    Ok((found.into_iter().map(|(of, _)| of).collect(), others))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use keyframe::BaseState;
+    use kinematics::Transform;
+
+    fn keyframe() -> Keyframe {
+        let placeholder = KeyframeSignature {
+            camera: "wrist".to_owned(),
+            stamp_nanos: 7,
+            size_px: [4, 2],
+            depth_size_px: None,
+            focal_px: [3.0; 2],
+            principal_px: [2.0, 1.0],
+            world_from_camera: [0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8],
+            map_from_odom: None,
+        }
+        .placeholder();
+        Keyframe {
+            base: Some(BaseState {
+                station: None,
+                world_from_base: Transform::translation(1.0, 0.0, 0.0),
+                map_from_odom: Transform::identity(),
+                truth: None,
+            }),
+            ..placeholder
+        }
+    }
+
+    #[test]
+    fn keyframe_with_a_revised_base_is_found_with_its_recorded_pose() {
+        let recorded = keyframe();
+        let expected = [KeyframeSignature::of(&recorded)];
+        let revision = Transform::new(
+            nalgebra::Vector3::new(0.003, -0.002, 0.001),
+            nalgebra::Vector3::new(0.001, 0.002, -0.004),
+        );
+        let revised = Arc::new(recorded.with_base_correction(&revision));
+        let (found, others) = match_keyframes(&expected, &[revised.clone()]).expect("a match");
+        assert!(others.is_empty());
+        assert_eq!(
+            KeyframeSignature::of(&found[0]).world_from_camera,
+            expected[0].world_from_camera
+        );
+        // Any other difference remains an error.
+        let moved = Arc::new(Keyframe {
+            world_from_camera: revision * revised.world_from_camera,
+            ..(*revised).clone()
+        });
+        assert!(matches!(
+            match_keyframes(&expected, &[moved]),
+            Err(Error::CheckpointData(_))
+        ));
+    }
 }

@@ -20,7 +20,7 @@ use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, PARTNERS_PER_IMAGE};
 use crate::{Candidate, ParamSet, Trial};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
-use nalgebra::{DVector, UnitQuaternion, Vector3};
+use nalgebra::{DVector, Point3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeSet;
@@ -77,16 +77,18 @@ pub struct StationCorrection {
 ///
 /// * `world_from_base`: the reported base pose from which the poses of the new station's keyframes
 ///   were computed.
+/// * `initial_motion`: world-frame motion of the base with which the search begins.
 pub fn register_station(
     reference: &[Arc<Keyframe>],
     new: &[Arc<Keyframe>],
     world_from_base: &Transform,
+    initial_motion: &Transform,
 ) -> Option<StationCorrection> {
     // A base has one pose per station, so its six parameters are always estimated together. The
     // criteria are the same as for cameras: the correction must be significant, and improve the
     // prediction of validation images.
     let scene = StationScene::new(reference, new, world_from_base)?;
-    let (estimate, solution, noise) = scene.fit()?;
+    let (estimate, solution, noise) = scene.fit(parameters(world_from_base, initial_motion))?;
     let trial = scene.evaluate(&estimate, noise);
     let sigma = |begin: usize| [0, 1, 2].map(|axis| solution.sigma(begin + axis));
     let is_significant = |ix: usize| {
@@ -158,6 +160,15 @@ fn base_motion(
         (position + translation_m - rotation * position).into(),
         rotation,
     )
+}
+
+/// Translation of a base and rotation about its own position that give a world-frame motion. See
+/// [`base_motion`].
+fn parameters(world_from_base: &Transform, motion: &Transform) -> DVector<f64> {
+    let position = Point3::from(world_from_base.translation.vector);
+    let translation_m = motion * position - position;
+    let rotation_rad = motion.rotation.scaled_axis();
+    DVector::from_iterator(6, translation_m.iter().chain(&rotation_rad).copied())
 }
 
 /// Describes an unobservable direction.
@@ -288,8 +299,8 @@ impl StationScene {
             .collect()
     }
 
-    /// Estimates translation, then rotation, from coarse to fine.
-    fn fit(&self) -> Option<(DVector<f64>, Solution, Noise)> {
+    /// Estimates translation and rotation, from coarse to fine.
+    fn fit(&self, mut estimate: DVector<f64>) -> Option<(DVector<f64>, Solution, Noise)> {
         let scales = DVector::from_fn(6, |ix, _| {
             if ix < 3 {
                 PRIOR_TRANSLATION_M
@@ -297,7 +308,6 @@ impl StationScene {
                 PRIOR_ROTATION_RAD
             }
         });
-        let mut estimate = DVector::zeros(6);
         let n_levels = self.images.iter().map(|image| image.levels.len()).max()?;
         let mut options = ResidualOptions {
             level: n_levels - 1,
@@ -401,6 +411,7 @@ mod tests {
     use super::*;
     use crate::MIN_VALIDATION_IMAGES;
     use crate::scenes::{Miscalibration, capture};
+    use kinematics::transform;
 
     /// Reported pose of the base at the second station.
     fn reported_base() -> Transform {
@@ -436,6 +447,10 @@ mod tests {
         ]
     }
 
+    fn register(reference: &[Arc<Keyframe>], new: &[Arc<Keyframe>]) -> Option<StationCorrection> {
+        register_station(reference, new, &reported_base(), &Transform::identity())
+    }
+
     /// Error of a pose, in millimeters at the base and in degrees.
     fn pose_error(remaining: &Transform) -> (f64, f64) {
         let position = reported_base().translation.vector;
@@ -450,7 +465,7 @@ mod tests {
     #[test]
     fn wrong_station_pose_is_corrected() {
         let [reference, new] = keyframes_of_two_stations(&drift(), 1.0);
-        let estimate = register_station(&reference, &new, &reported_base()).unwrap();
+        let estimate = register(&reference, &new).unwrap();
         assert!(
             estimate.kept && estimate.unobservable.is_empty() && estimate.gain_db > 3.0,
             "{estimate:?}"
@@ -470,6 +485,12 @@ mod tests {
             (0.02..1.0).contains(&sigma_mm),
             "standard deviation {sigma_mm} mm, error {mm} mm"
         );
+        // A search that begins elsewhere ends at the same pose.
+        let initial = transform::interpolate(&Transform::identity(), &drift().inverse(), 0.9);
+        let again = register_station(&reference, &new, &reported_base(), &initial).unwrap();
+        let [one, other] = [&estimate, &again].map(|of| of.map_from_odom(&reported_base(), 1.0));
+        let (mm, degrees) = pose_error(&(other * one.inverse()));
+        assert!(mm < 0.1 && degrees < 0.01, "{mm} mm, {degrees} degrees");
         // At half of the path, half of the error is corrected.
         let half = estimate.map_from_odom(&reported_base(), 0.5);
         let (mm_half, degrees_half) = pose_error(&half);
@@ -483,7 +504,7 @@ mod tests {
     fn correct_station_pose_is_kept() {
         for noise in [0.3, 1.0, 3.0] {
             let [reference, new] = keyframes_of_two_stations(&Transform::identity(), noise);
-            let estimate = register_station(&reference, &new, &reported_base()).unwrap();
+            let estimate = register(&reference, &new).unwrap();
             assert!(
                 !estimate.kept && estimate.n_validation_images >= MIN_VALIDATION_IMAGES,
                 "{estimate:?}"
@@ -499,8 +520,8 @@ mod tests {
     fn station_without_overlap_gives_none() {
         let [reference, new] =
             keyframes_of_two_stations(&Transform::translation(50.0, 0.0, 0.0), 1.0);
-        assert_eq!(register_station(&reference, &new, &reported_base()), None);
-        assert_eq!(register_station(&[], &new, &reported_base()), None);
+        assert_eq!(register(&reference, &new), None);
+        assert_eq!(register(&[], &new), None);
         let flat: Vec<_> = new
             .iter()
             .map(|keyframe| {
@@ -510,7 +531,7 @@ mod tests {
                 })
             })
             .collect();
-        assert_eq!(register_station(&reference, &flat, &reported_base()), None);
+        assert_eq!(register(&reference, &flat), None);
     }
 
     #[test]
@@ -530,8 +551,7 @@ mod tests {
                 .num_threads(n)
                 .build()
                 .unwrap();
-            pool.install(|| register_station(reference, new, &reported_base()))
-                .unwrap()
+            pool.install(|| register(reference, new)).unwrap()
         };
         assert_eq!(
             with_threads(1, &reference, &new),
@@ -572,7 +592,7 @@ mod tests {
             .iter()
             .map(|keyframe| Arc::new(keyframe.with_base_correction(&pose_error)))
             .collect();
-        let estimate = register_station(&all[..12], &new, &reported_base()).unwrap();
+        let estimate = register(&all[..12], &new).unwrap();
         assert_eq!(estimate.unobservable.len(), 3, "{estimate:?}");
         assert!(
             (estimate.translation_m[0] + 0.01).abs() < 3e-4

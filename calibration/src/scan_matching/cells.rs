@@ -11,9 +11,6 @@ const MIN_POINTS: u32 = 10;
 const REFRESH_GROWTH: f64 = 1.3;
 /// Maximum variance across a plane, relative to the smaller variance along it.
 const MAX_THICKNESS: f64 = 0.01;
-/// Standard deviation that is added to the allowed thickness, meters. It is the noise of a range
-/// scanner, which does not become smaller in small cells.
-const SCANNER_NOISE_M: f64 = 0.03;
 /// Minimum variance along the narrow side of a plane, relative to that along its wide side. The
 /// points of a single ring lie on a line, which has no normal.
 const MIN_WIDTH: f64 = 0.05;
@@ -80,17 +77,19 @@ impl Cell {
     }
 
     /// Computes the plane again if the cell has enough new points.
-    pub(super) fn refresh(&mut self, center: &Point3<f64>) {
+    ///
+    /// * `noise_m`: standard deviation that is added to the allowed thickness, meters.
+    pub(super) fn refresh(&mut self, center: &Point3<f64>, noise_m: f64) {
         let is_known = f64::from(self.n_points) < REFRESH_GROWTH * f64::from(self.n_in_plane);
         let is_last = self.n_points == MAX_POINTS && self.n_in_plane < MAX_POINTS;
         if self.n_points < MIN_POINTS || (is_known && !is_last) {
             return;
         }
         self.n_in_plane = self.n_points;
-        self.plane = self.fit(center);
+        self.plane = self.fit(center, noise_m);
     }
 
-    fn fit(&self, center: &Point3<f64>) -> Option<Plane> {
+    fn fit(&self, center: &Point3<f64>, noise_m: f64) -> Option<Plane> {
         let n = f64::from(self.n_points);
         let mean = self.sum / n;
         let covariance = self.sum_of_products / n - mean * mean.transpose();
@@ -98,7 +97,7 @@ impl Cell {
         let mut order = [0, 1, 2];
         order.sort_by(|a, b| eigen.eigenvalues[*a].total_cmp(&eigen.eigenvalues[*b]));
         let [thin, narrow, wide] = order.map(|ix| eigen.eigenvalues[ix].max(0.0));
-        let is_plane = thin <= MAX_THICKNESS * narrow + SCANNER_NOISE_M * SCANNER_NOISE_M
+        let is_plane = thin <= MAX_THICKNESS * narrow + noise_m * noise_m
             && narrow >= MIN_WIDTH * wide
             // A cluster of points has no normal.
             && narrow >= 4.0 * thin

@@ -1,6 +1,6 @@
 //! Follows the drift of odometry from one range scan to the next.
 
-use super::{ScanMatch, SurfaceMap, match_scan};
+use super::{RangeSensor, ScanMatch, SurfaceMap, match_scan};
 use kinematics::Transform;
 use nalgebra::{Matrix6, Point3, Vector6};
 
@@ -27,17 +27,24 @@ pub struct DriftTracker {
     last: Option<Transform>,
 }
 
-impl Default for DriftTracker {
-    fn default() -> Self {
+impl DriftTracker {
+    /// A tracker that has seen nothing yet.
+    #[must_use]
+    pub fn new(sensor: RangeSensor) -> Self {
         Self {
-            map: SurfaceMap::default(),
+            map: SurfaceMap::new(sensor),
             covariance: Matrix6::zeros(),
             last: None,
         }
     }
-}
 
-impl DriftTracker {
+    /// Covariance of the correction at the last scan, as in [`ScanMatch::covariance`]. Before the
+    /// first one, it is zero.
+    #[must_use]
+    pub fn covariance(&self) -> &Matrix6<f64> {
+        &self.covariance
+    }
+
     /// Adds a scan, and returns how it was matched. `None` if it was added without a comparison,
     /// because it is the first one, or because no earlier scan has seen the same surfaces.
     ///

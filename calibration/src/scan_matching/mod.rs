@@ -1,6 +1,6 @@
-//! Matching of range scans with the surfaces that earlier scans have measured.
+//! Matching of range scans and depth images with the surfaces that earlier ones have measured.
 //!
-//! Odometry drifts, but the walls of a room do not. Each scan is moved so that its points lie on
+//! Odometry drifts, but the walls of a room do not. Each scan or depth image is moved so that its points lie on
 //! the planes of a [`SurfaceMap`] (point to plane, Chen and Medioni 1992; planes in cells as in
 //! `VoxelMap`, Yuan et al. 2022). The pose from odometry is the prior, with a covariance that grows
 //! with the distance traveled. A direction that the surfaces do not determine, such as that along a
@@ -30,15 +30,62 @@ const MIN_PLANES: usize = 6;
 const MAX_STEPS: usize = 20;
 /// Steps that are smaller than this end the search, meters and radians.
 const CONVERGED: f64 = 2e-5;
-/// Maximum distance of a point from its plane, in the first step and in the last ones, meters.
-const MAX_DISTANCE_M: [f64; 2] = [0.5, 0.1];
 /// Minimum information about a direction of translation, relative to the information that errors of
 /// normals give.
 const MIN_INFORMATION: f64 = 5.0;
-/// Noise of a point beside the variance of the plane, and error of a plane that more points do not
-/// reduce, meters.
-const POINT_NOISE_M: f64 = 0.005;
-const PLANE_ERROR_M: f64 = 0.004;
+
+/// The kind of sensor that measures the points.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RangeSensor {
+    /// A scanner with centimeters of noise, which sees the walls of a room.
+    Scanner,
+    /// A depth camera with millimeters of noise, which sees the things within reach of an arm.
+    DepthCamera,
+}
+
+impl RangeSensor {
+    /// Sides of the cells of a map, meters. Large planes such as walls are found in large cells,
+    /// which give the most accurate normals. Small cells find planes between other things.
+    fn cell_sides_m(self) -> [f64; 4] {
+        match self {
+            Self::Scanner => [1.6, 0.8, 0.4, 0.2],
+            Self::DepthCamera => [0.8, 0.4, 0.2, 0.1],
+        }
+    }
+
+    /// Standard deviation of the points across a plane that may come from noise alone, meters. It
+    /// does not become smaller in small cells.
+    fn noise_m(self) -> f64 {
+        match self {
+            Self::Scanner => 0.03,
+            Self::DepthCamera => 0.006,
+        }
+    }
+
+    /// Noise of a point beside the variance of its plane, meters.
+    fn point_noise_m(self) -> f64 {
+        match self {
+            Self::Scanner => 0.005,
+            Self::DepthCamera => 0.001,
+        }
+    }
+
+    /// Maximum distance of a point from its plane, in the first step and in the last ones, meters.
+    fn max_distance_m(self) -> [f64; 2] {
+        match self {
+            Self::Scanner => [0.5, 0.1],
+            Self::DepthCamera => [0.1, 0.02],
+        }
+    }
+
+    /// Error of a plane that more points do not reduce, meters.
+    fn plane_error_m(self) -> f64 {
+        match self {
+            Self::Scanner => 0.004,
+            Self::DepthCamera => 0.001,
+        }
+    }
+}
 
 /// How accurately a scan was matched.
 #[derive(Clone, Debug, PartialEq)]
@@ -83,11 +130,11 @@ fn match_scan(
     let stride = points.len().div_ceil(MAX_POINTS).max(1);
     let points: Vec<Point3<f64>> = points.iter().step_by(stride).copied().collect();
     let prior_information = Cholesky::new(*prior)?.inverse();
+    let [widest_m, narrowest_m] = map.sensor().max_distance_m();
     let mut motion = Transform::identity();
     for step in 0..MAX_STEPS {
         let narrowed = (step as f64 / 4.0).min(1.0);
-        let max_distance_m =
-            MAX_DISTANCE_M[0] * (MAX_DISTANCE_M[1] / MAX_DISTANCE_M[0]).powf(narrowed);
+        let max_distance_m = widest_m * (narrowest_m / widest_m).powf(narrowed);
         let matches = find_matches(map, &points, base, &motion, max_distance_m);
         let n_planes = count_planes(&matches);
         if matches.len() < MIN_MATCHED || n_planes.len() < MIN_PLANES {
@@ -128,11 +175,13 @@ fn find_matches(
     motion: &Transform,
     max_distance_m: f64,
 ) -> Vec<Match> {
+    let [point_noise_m, plane_error_m] =
+        [map.sensor().point_noise_m(), map.sensor().plane_error_m()];
     let moved = points.iter().map(|point| motion * point);
     let matches = moved.filter_map(|point| {
         let (cell, plane) = map.plane_at(&point)?;
         let distance_m = plane.distance_m(&point);
-        let noise = plane.variance + POINT_NOISE_M * POINT_NOISE_M;
+        let noise = plane.variance + point_noise_m * point_noise_m;
         (distance_m.abs() <= max_distance_m).then(|| Match {
             cell,
             normal: plane.normal,
@@ -140,7 +189,7 @@ fn find_matches(
             distance_m,
             variance: [
                 noise,
-                plane.variance_at(&point, noise) + PLANE_ERROR_M * PLANE_ERROR_M,
+                plane.variance_at(&point, noise) + plane_error_m * plane_error_m,
             ],
             normal_variance: plane.normal_variance(noise),
         })

@@ -1,12 +1,10 @@
 //! A map of the surfaces that range scans have measured.
 
+use super::RangeSensor;
 use super::cells::{Cell, Plane};
 use nalgebra::Point3;
 use rustc_hash::FxHashMap;
 
-/// Sides of the cells, meters. Large planes such as walls are found in large cells, which give the
-/// most accurate normals. Small cells find planes between other things.
-const SIDES_M: [f64; 4] = [1.6, 0.8, 0.4, 0.2];
 /// Two grids per side. The second one is moved by half a cell. A plane near the boundary of a cell
 /// is divided between two cells, and each of them would get a wrong plane. In one of both grids, the
 /// plane is in the middle of the cells.
@@ -17,6 +15,7 @@ const MAX_OFFSET: f64 = 0.3;
 /// Surfaces that were seen so far: planes in the cells of several grids.
 #[derive(Debug)]
 pub(super) struct SurfaceMap {
+    sensor: RangeSensor,
     grids: Vec<Grid>,
 }
 
@@ -35,12 +34,15 @@ pub(super) struct CellId {
     key: [i32; 3],
 }
 
-impl Default for SurfaceMap {
-    fn default() -> Self {
-        let grids = SIDES_M
-            .iter()
-            .flat_map(|side_m| (0..N_GRIDS).map(move |shift| (*side_m, shift)));
+impl SurfaceMap {
+    /// An empty map for the points of a sensor.
+    pub(super) fn new(sensor: RangeSensor) -> Self {
+        let grids = sensor
+            .cell_sides_m()
+            .into_iter()
+            .flat_map(|side_m| (0..N_GRIDS).map(move |shift| (side_m, shift)));
         Self {
+            sensor,
             grids: grids
                 .map(|(side_m, shift)| Grid {
                     side_m,
@@ -49,6 +51,11 @@ impl Default for SurfaceMap {
                 })
                 .collect(),
         }
+    }
+
+    /// The sensor whose points the map contains.
+    pub(super) fn sensor(&self) -> RangeSensor {
+        self.sensor
     }
 }
 
@@ -95,7 +102,7 @@ impl SurfaceMap {
             for key in changed {
                 let center = grid.center(key);
                 if let Some(cell) = grid.cells.get_mut(&key) {
-                    cell.refresh(&center);
+                    cell.refresh(&center, self.sensor.noise_m());
                 }
             }
         }

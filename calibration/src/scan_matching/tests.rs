@@ -113,7 +113,7 @@ struct Walk<'a> {
 impl Walk<'_> {
     fn errors(&self, seed: u64) -> Errors {
         let mut random = Random::new(seed);
-        let mut tracker = DriftTracker::default();
+        let mut tracker = DriftTracker::new(RangeSensor::Scanner);
         let mut correction = Transform::identity();
         let mut odom_from_world = Transform::identity();
         let mut errors = Errors {
@@ -250,7 +250,7 @@ fn along_a_corridor_the_base_follows_odometry() {
 
 #[test]
 fn a_scan_without_known_surfaces_extends_the_map() {
-    let mut tracker = DriftTracker::default();
+    let mut tracker = DriftTracker::new(RangeSensor::Scanner);
     let mut random = Random::new(6);
     let here = on_lap(0.0);
     let in_room: Vec<_> = scan(&ROOM, &FURNITURE, &here, &mut random)

@@ -9,6 +9,8 @@ use std::sync::Arc;
 pub enum Change {
     /// A new keyframe.
     Accepted(Arc<Keyframe>),
+    /// A keyframe that was accepted before, with a more accurate pose.
+    Revised(Arc<Keyframe>),
     /// A keyframe was evicted from the full store.
     Evicted {
         /// Name of its camera.

@@ -2,14 +2,14 @@
 
 use super::camera_motion::Motion;
 use crate::pose_distance::PoseDistance;
-use calibration::DriftTracker;
+use calibration::{DriftTracker, RangeSensor};
 use keyframe::RangePoints;
 use kinematics::Stamp;
 use nalgebra::Point3;
 use serde::Serialize;
 
 /// Corrects the drift of the base with range scans.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct ScanCorrection {
     tracker: DriftTracker,
     report: DriftReport,
@@ -36,6 +36,17 @@ pub struct DriftReport {
     base_error: Option<[PoseDistance; 2]>,
 }
 
+impl Default for ScanCorrection {
+    fn default() -> Self {
+        Self {
+            tracker: DriftTracker::new(RangeSensor::Scanner),
+            report: DriftReport::default(),
+            squared_errors: Default::default(),
+            n_errors: 0.0,
+        }
+    }
+}
+
 impl ScanCorrection {
     pub(super) fn report(&self) -> &DriftReport {
         &self.report
@@ -43,7 +54,7 @@ impl ScanCorrection {
 
     /// Forgets the surfaces, because the source has restarted.
     pub(super) fn restart(&mut self) {
-        self.tracker = DriftTracker::default();
+        self.tracker = DriftTracker::new(RangeSensor::Scanner);
     }
 
     /// Matches a scan with earlier ones, and corrects base poses from then on. Returns the scan with

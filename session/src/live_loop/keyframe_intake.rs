@@ -101,12 +101,23 @@ impl KeyframeIntake {
 
     /// Adds an accepted keyframe. Returns it as the models receive it.
     pub(super) fn accept(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
-        let keyframe = match &mut self.change {
-            Some(change) => change(keyframe),
-            None => keyframe,
-        };
+        let keyframe = self.changed(keyframe);
         self.accepted.list.push(keyframe.clone());
         keyframe
+    }
+
+    /// Replaces an accepted keyframe. Returns it as the models receive it.
+    pub(super) fn revise(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
+        let keyframe = self.changed(keyframe);
+        self.accepted.revise(&keyframe);
+        keyframe
+    }
+
+    fn changed(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
+        match &mut self.change {
+            Some(change) => change(keyframe),
+            None => keyframe,
+        }
     }
 
     /// Progress until training starts.
@@ -189,6 +200,7 @@ pub(super) struct AcceptedKeyframes {
     pub(super) list: Vec<Arc<Keyframe>>,
     /// Number of keyframes evicted so far.
     pub(super) n_evicted: u64,
+    n_revised: u64,
 }
 
 impl AcceptedKeyframes {
@@ -200,10 +212,24 @@ impl AcceptedKeyframes {
             .any(|keyframe| keyframe.split == Split::Train)
     }
 
-    /// Number of accepted keyframes and number of evicted keyframes. The length of the list is not
-    /// enough to detect a change: in a full store, each new keyframe replaces another one.
-    pub(super) fn n_changes(&self) -> (u64, u64) {
-        (self.list.len() as u64 + self.n_evicted, self.n_evicted)
+    /// Number of accepted, of evicted and of revised keyframes. The length of the list is not enough
+    /// to detect a change: in a full store, each new keyframe replaces another one.
+    pub(super) fn n_changes(&self) -> [u64; 3] {
+        [
+            self.list.len() as u64 + self.n_evicted,
+            self.n_evicted,
+            self.n_revised,
+        ]
+    }
+
+    fn revise(&mut self, revised: &Arc<Keyframe>) {
+        self.n_revised += 1;
+        let is_same = |keyframe: &&mut Arc<Keyframe>| {
+            keyframe.camera == revised.camera && keyframe.stamp == revised.stamp
+        };
+        if let Some(keyframe) = self.list.iter_mut().find(is_same) {
+            *keyframe = Arc::clone(revised);
+        }
     }
 
     pub(super) fn evict(&mut self, camera: &Arc<str>, stamp: Stamp) {

@@ -76,6 +76,10 @@ impl LiveLoop {
     fn apply(&mut self, FeedItem { change, times }: FeedItem) -> anyhow::Result<()> {
         match change {
             Change::Accepted(keyframe) => self.add_keyframe(keyframe, times),
+            Change::Revised(keyframe) => {
+                let keyframe = self.intake.revise(keyframe);
+                self.models.revise(&keyframe)
+            }
             Change::Evicted { camera, stamp } => {
                 self.intake.accepted.evict(&camera, stamp);
                 self.models.remove(&camera, stamp)

@@ -81,6 +81,16 @@ impl Models {
         pushed
     }
 
+    /// Replaces a keyframe with a version that has a more accurate pose.
+    pub(super) fn revise(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
+        let mut revised = Ok(());
+        for session in self.unfinished() {
+            // As in `push`, a failure must not leave the sessions with different keyframes.
+            revised = revised.and(session.revise(keyframe));
+        }
+        revised
+    }
+
     /// Removes an evicted keyframe from the models.
     pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) -> anyhow::Result<()> {
         let mut removed = Ok(());

@@ -176,7 +176,7 @@ impl OpenedRun<'_> {
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
         let devices = (source, stamp_clock);
-        let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), devices, held)?;
+        let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), pace, devices, held)?;
         input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig)?;
         let steering = steered
@@ -291,12 +291,23 @@ fn run_folder_of(folders: &[PathBuf]) -> &Path {
     run.unwrap_or(Path::new(""))
 }
 
+/// The corrections of a moving base. In lockstep, their order must not depend on the computer.
+fn stations(rig: &Rig, pace: Pace, previous: &[Arc<Keyframe>]) -> Option<Stations> {
+    let stations = Stations::new(rig)?.resume_from(previous);
+    Some(if pace == Pace::RealTime {
+        stations
+    } else {
+        stations.final_only()
+    })
+}
+
 /// The input, with the keyframes of the previous run restored. Also returns keyframes that exceed
 /// the memory limit.
 fn input(
     plan: &RunPlan,
     rig: &Rig,
     meshes: Option<&RecordedMeshes>,
+    pace: Pace,
     (source, stamp_clock): (Box<dyn Source>, StampClock),
     previous: &[Arc<Keyframe>],
 ) -> anyhow::Result<(Input, Vec<Evicted>)> {
@@ -315,7 +326,7 @@ fn input(
     let input = Input {
         source,
         join,
-        stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
+        stations: stations(rig, pace, previous),
         recorder,
         robot_motion: RobotMotion::new(rig),
         stamp_clock,

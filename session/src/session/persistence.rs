@@ -135,6 +135,13 @@ impl Persistence {
         }
     }
 
+    /// Stores a keyframe again, because its pose was revised.
+    pub(super) fn store_again(&mut self, keyframe: &Arc<Keyframe>) {
+        if let Some(checkpoints) = &mut self.checkpoints {
+            checkpoints.store_again(keyframe);
+        }
+    }
+
     /// Sets how many images did not become keyframes so far, by reason, for the next checkpoint.
     pub(crate) fn set_rejected(&mut self, rejected: &BTreeMap<String, u64>) {
         if let Some(checkpoints) = &mut self.checkpoints {

@@ -17,7 +17,7 @@ use kinematics::Stamp;
 use messages::{BadInput, InsufficientData, Setting};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 use trainer::{ModelKind, ModelSpec};
 
@@ -26,6 +26,9 @@ pub(super) struct Replay {
     path: PathBuf,
     decisions: Decisions,
     model_spec: ModelSpec,
+    /// The keyframes whose poses were revised during the logged run, with the poses of the
+    /// recording.
+    revised: OnceLock<Vec<Arc<Keyframe>>>,
 }
 
 impl Replay {
@@ -50,6 +53,7 @@ impl Replay {
             path: path.to_owned(),
             decisions,
             model_spec,
+            revised: OnceLock::new(),
         };
         if replay.decisions.pushed().next().is_none() {
             return Err(InsufficientData(format!(
@@ -63,19 +67,19 @@ impl Replay {
 
     /// Returns an error if a keyframe of the log is missing from the data or differs.
     fn check_keyframes(&self, path: &Path, data: &Data) -> anyhow::Result<()> {
-        let by_key = by_name(&data.keyframes);
+        let by_key = self.by_name(&data.keyframes);
         let name = self.name();
         let shown = path.display();
         for pushed in self.decisions.pushed() {
             let camera = &*pushed.camera;
             let stamp = pushed.stamp_nanos;
-            let Some(keyframe) = by_key.get(&(camera, stamp)) else {
+            let Some(keyframe) = by_key.get(&(camera, stamp)).map(|of| of.as_pushed(pushed)) else {
                 return Err(InsufficientData(format!(
                     "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
                 ))
                 .into());
             };
-            if !pushed.matches(keyframe) {
+            if !pushed.matches(&keyframe) {
                 return Err(InsufficientData(format!(
                     "image {stamp} of camera {camera:?} differs in pixels, depth, intrinsics or pose between {shown} \
                      and {name}"
@@ -148,7 +152,7 @@ impl Replay {
         keyframes: &[Arc<Keyframe>],
         stop: &Stop,
     ) -> anyhow::Result<()> {
-        let by_key = by_name(keyframes);
+        let by_key = self.by_name(keyframes);
         session.time().start(Instant::now());
         for entry in &self.decisions.entries {
             // Trains up to the step of the decision. Steps of rejected trials count, too, because
@@ -174,8 +178,8 @@ impl Replay {
             }
             match &entry.decision {
                 Decision::Push(pushed) => {
-                    if let Some(keyframe) = by_key.get(&(&*pushed.camera, pushed.stamp_nanos)) {
-                        session.push(keyframe)?;
+                    if let Some(keyframe) = by_key.get(&pushed.key()) {
+                        session.push(&keyframe.as_pushed(pushed))?;
                     }
                 }
                 Decision::Remove(removed) => {
@@ -212,6 +216,18 @@ impl Replay {
                 .map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())),
         );
         overrides
+    }
+
+    /// The keyframes of the data by camera and stamp.
+    fn by_name<'a>(&'a self, keyframes: &'a [Arc<Keyframe>]) -> HashMap<(&'a str, i64), Found<'a>> {
+        let revised = self.revised.get().map_or(&[][..], Vec::as_slice);
+        let all = keyframes.iter().map(Found::AsPushed);
+        let all = all.chain(revised.iter().map(Found::Revised));
+        let key = |keyframe: &'a Arc<Keyframe>| (&*keyframe.camera, keyframe.stamp.0);
+        all.map(|found| match found {
+            Found::AsPushed(keyframe) | Found::Revised(keyframe) => (key(keyframe), found),
+        })
+        .collect()
     }
 
     fn name(&self) -> String {
@@ -280,9 +296,14 @@ impl Schedule for Replay {
             &self.overrides(),
             progress,
         )?;
-        let as_pushed: HashMap<(&str, i64), &Pushed> = pushed()
-            .map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed))
-            .collect();
+        let revised = data.keyframes.iter().filter(|keyframe| {
+            let key = (&*keyframe.camera, keyframe.stamp.0);
+            pushed().filter(|pushed| pushed.key() == key).count() > 1
+        });
+        let _ = self.revised.set(revised.cloned().collect());
+        // The last pose of a keyframe is the one with which the run ended.
+        let as_pushed: HashMap<(&str, i64), &Pushed> =
+            pushed().map(|pushed| (pushed.key(), pushed)).collect();
         // The data have base poses as reported. The logged run has corrected them at stations, and
         // these corrections depend on timing, so they come from the log.
         for keyframe in &mut data.keyframes {
@@ -342,9 +363,20 @@ impl Schedule for Replay {
     }
 }
 
-fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {
-    keyframes
-        .iter()
-        .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
-        .collect()
+/// A keyframe of the data.
+enum Found<'a> {
+    /// Its pose was never revised, so it is as it was pushed.
+    AsPushed(&'a Arc<Keyframe>),
+    /// Its pose was revised; here it has the pose of the recording.
+    Revised(&'a Arc<Keyframe>),
+}
+
+impl Found<'_> {
+    /// The keyframe as it was pushed this time.
+    fn as_pushed(&self, pushed: &Pushed) -> Arc<Keyframe> {
+        match self {
+            Self::AsPushed(keyframe) => Arc::clone(keyframe),
+            Self::Revised(keyframe) => pushed.corrected(keyframe),
+        }
+    }
 }

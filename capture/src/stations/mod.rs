@@ -5,17 +5,28 @@
 //! first station pass unchanged. Later, keyframes are queued while the base moves. The first
 //! keyframes of the next station are queued as well, until this station can be registered with
 //! earlier stations ([`calibration::register_station`]). Then these keyframes and all later ones
-//! pass with the correction. The result depends only on the keyframes and their order, so that a
-//! run, its recording and the replay of that recording agree. Only the time at which keyframes pass
-//! depends on a clock.
+//! pass with the correction.
+//!
+//! An operator should not have to wait for this. If the depth of a queued keyframe determines the
+//! drift of the base well enough ([`DepthTracking`]), the keyframe passes at once with this
+//! provisional correction, and is revised when its station is registered.
+//!
+//! The final poses depend only on the keyframes and their order, so that a run, its recording and
+//! the replay of that recording agree. Only the time at which keyframes pass, and whether they pass
+//! with a provisional correction first, depends on a clock.
+
+mod depth_tracking;
+#[cfg(test)]
+mod tests;
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::Change;
 use crate::pose_distance::PoseDistance;
 use background::{Task, run_in_background_pool};
 use calibration::{MIN_VALIDATION_IMAGES, StationCorrection, register_station};
+use depth_tracking::DepthTracking;
 use keyframe::{BaseState, Keyframe, Split};
-use kinematics::{Stamp, Transform};
+use kinematics::{Stamp, Transform, transform};
 use messages::counted;
 use serde::Serialize;
 use std::collections::{BTreeSet, VecDeque};
@@ -59,14 +70,60 @@ pub struct Stations {
     map_from_odom: Transform,
     /// Corrected keyframes with depth from all stations so far.
     reference_keyframes: Vec<Arc<Keyframe>>,
+    /// Follows the drift between the stations.
+    tracking: DepthTracking,
+    /// What registration has added to the correction by depth tracking. `None` if it is unknown,
+    /// because the run continues an earlier one.
+    map_from_tracked: Option<Transform>,
     /// Queued keyframes on the way to the next station and at it, in order.
-    held: Vec<Change>,
+    held: Vec<Waiting>,
     /// Changes received since registration of the next station started.
-    queue: VecDeque<Change>,
+    queue: VecDeque<Waiting>,
     search: Option<Task<SearchResult>>,
+    /// Whether keyframes pass only with their final pose, so that their order does not depend on
+    /// the speed of the computer.
+    is_final_only: bool,
     reported: Vec<StationReport>,
     /// Total time spent on registration.
     spent: Duration,
+}
+
+/// A change that is queued, or whose keyframe has passed with a provisional correction.
+struct Waiting {
+    change: Change,
+    /// The correction by depth tracking; `None` if depth does not determine it.
+    tracked_from_odom: Option<Transform>,
+    stage: Stage,
+}
+
+/// What has become of a waiting change.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Stage {
+    /// It has not passed.
+    Queued,
+    /// It is a keyframe, and has passed with a provisional correction.
+    Provisional,
+    /// It has passed, and nothing follows.
+    Done,
+}
+
+impl Waiting {
+    fn keyframe(&self) -> Option<&Arc<Keyframe>> {
+        match &self.change {
+            Change::Accepted(keyframe) => Some(keyframe),
+            Change::Revised(_) | Change::Evicted { .. } => None,
+        }
+    }
+
+    /// What is left to pass on, if `corrected` is the keyframe with its final correction.
+    fn settled(self, corrected: Option<Arc<Keyframe>>) -> Option<Change> {
+        match (self.stage, corrected) {
+            (Stage::Done, _) => None,
+            (Stage::Provisional, Some(keyframe)) => Some(Change::Revised(keyframe)),
+            (_, Some(keyframe)) => Some(Change::Accepted(keyframe)),
+            (_, None) => Some(self.change),
+        }
+    }
 }
 
 /// Change of the base correction from the station that the base left to the new one.
@@ -77,29 +134,48 @@ struct CorrectionChange<'a> {
     arrived: Transform,
     /// The correction before the new station.
     before: Transform,
-    /// The additional correction that registration estimated. `None` if the images do not overlap
-    /// with those of earlier stations.
+    /// The correction at the new station by depth tracking; `None` if depth did not determine it.
+    tracked: Option<Transform>,
+    /// The correction that registration estimated, relative to `before`. `None` if the images do
+    /// not overlap with those of earlier stations.
     estimated: Option<&'a StationCorrection>,
 }
 
 impl CorrectionChange<'_> {
-    /// The correction of a base state.
+    /// The correction of a base state. `tracked`: the correction there by depth tracking.
     ///
     /// Drift accumulates with the distance traveled. On the way between the two stations, a
     /// keyframe therefore gets a share of the correction in proportion to that distance.
-    fn of(&self, at: &BaseState) -> Transform {
+    fn of(&self, at: &BaseState, tracked: Option<Transform>) -> Transform {
         if at.station.is_some() {
-            return self.at(&self.arrived, 1.0);
+            return self.at_arrival();
         }
         let from = distance(&self.left, &at.world_from_base);
         let to = distance(&at.world_from_base, &self.arrived);
         // If the base has not moved yet, it has not drifted. The condition also avoids 0 / 0.
         let fraction = if from > 0.0 { from / (from + to) } else { 0.0 };
-        self.at(&at.world_from_base, fraction)
+        match (tracked, self.tracked) {
+            // What depth tracking has missed until the arrival accumulates in the same way.
+            (Some(tracked), Some(at_arrival)) => {
+                let missed = self.at_arrival() * at_arrival.inverse();
+                transform::interpolate(&Transform::identity(), &missed, fraction) * tracked
+            }
+            _ => self.estimated(&at.world_from_base, fraction),
+        }
     }
 
-    /// The correction at a reported base pose that lies at this fraction of the path.
-    fn at(&self, reported: &Transform, fraction: f64) -> Transform {
+    /// The correction at the new station.
+    fn at_arrival(&self) -> Transform {
+        let is_estimated = self.estimated.is_some_and(|estimated| estimated.kept);
+        match self.tracked {
+            Some(tracked) if !is_estimated => tracked,
+            _ => self.estimated(&self.arrived, 1.0),
+        }
+    }
+
+    /// The correction by registration at a reported base pose that lies at this fraction of the
+    /// path.
+    fn estimated(&self, reported: &Transform, fraction: f64) -> Transform {
         let guess = self.before * reported;
         self.estimated.map_or(self.before, |correction| {
             correction.map_from_odom(&guess, fraction) * self.before
@@ -123,6 +199,9 @@ pub struct StationReport {
     /// The correction since the previous station; null if the images do not overlap with those of
     /// earlier stations.
     correction: Option<StationCorrection>,
+    /// How far depth tracking has moved the base since the previous station, before registration;
+    /// null if depth does not determine it.
+    tracked: Option<PoseDistance>,
     /// Error of the base pose before and after the correction. It is known only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     base_error: Option<[PoseDistance; 2]>,
@@ -149,12 +228,23 @@ impl Stations {
             world_from_base: Transform::identity(),
             map_from_odom: Transform::identity(),
             reference_keyframes: Vec::new(),
+            tracking: DepthTracking::new(),
+            map_from_tracked: Some(Transform::identity()),
             held: Vec::new(),
             queue: VecDeque::new(),
             search: None,
+            is_final_only: false,
             reported: Vec::new(),
             spent: Duration::ZERO,
         })
+    }
+
+    /// Passes keyframes only with their final pose, and waits for it. The order of the keyframes
+    /// then does not depend on the speed of the computer.
+    #[must_use]
+    pub fn final_only(mut self) -> Self {
+        self.is_final_only = true;
+        self
     }
 
     /// Continues after the keyframes of an earlier run. The first station is registered with these
@@ -171,6 +261,8 @@ impl Stations {
             .find_map(|keyframe| keyframe.base.as_ref())
         {
             self.station = Some(PREVIOUS_RUN);
+            // The base may have been moved since then.
+            self.map_from_tracked = None;
             self.world_from_base = base_state.world_from_base;
             self.map_from_odom = base_state.map_from_odom;
         }
@@ -182,10 +274,66 @@ impl Stations {
 
     /// Processes a change. Returns the changes that can be passed on, in order.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
-        self.queue.push_back(change);
+        let tracked_from_odom = match &change {
+            Change::Accepted(keyframe) => self.tracking.add(keyframe),
+            Change::Revised(_) | Change::Evicted { .. } => None,
+        };
+        self.queue.push_back(Waiting {
+            change,
+            tracked_from_odom,
+            stage: Stage::Queued,
+        });
         let mut released = Vec::new();
-        self.process_queue(false, &mut released);
+        self.process_queue(self.is_final_only, &mut released);
+        if !self.is_final_only {
+            self.pass_provisionally(&mut released);
+        }
         released
+    }
+
+    /// Passes on what need not wait: keyframes whose depth determines the drift of the base, and
+    /// keyframes of cameras that do not move with the base.
+    fn pass_provisionally(&mut self, released: &mut Vec<Change>) {
+        let mut waiting: Vec<&mut Waiting> = self.held.iter_mut().chain(&mut self.queue).collect();
+        for ix in 0..waiting.len() {
+            if waiting[ix].stage != Stage::Queued {
+                continue;
+            }
+            let passed = match &waiting[ix].change {
+                Change::Accepted(keyframe) if keyframe.base.is_none() => {
+                    Some((Change::Accepted(Arc::clone(keyframe)), Stage::Done))
+                }
+                Change::Accepted(keyframe) => {
+                    let correction = self.map_from_tracked.zip(waiting[ix].tracked_from_odom);
+                    correction.map(|(map_from_tracked, tracked_from_odom)| {
+                        let keyframe = carried(keyframe, &(map_from_tracked * tracked_from_odom));
+                        (Change::Accepted(keyframe), Stage::Provisional)
+                    })
+                }
+                Change::Evicted { camera, stamp } => {
+                    let (camera, stamp) = (Arc::clone(camera), *stamp);
+                    let is_of = |waiting: &&mut Waiting| {
+                        let keyframe = waiting.keyframe();
+                        keyframe.is_some_and(|of| of.camera == camera && of.stamp == stamp)
+                    };
+                    let evicted = waiting[..ix].iter_mut().find(|waiting| is_of(waiting));
+                    // An eviction must not overtake the keyframe that it evicts.
+                    let has_passed = evicted.is_none_or(|evicted| {
+                        let has_passed = evicted.stage != Stage::Queued;
+                        if has_passed {
+                            evicted.stage = Stage::Done;
+                        }
+                        has_passed
+                    });
+                    has_passed.then_some((Change::Evicted { camera, stamp }, Stage::Done))
+                }
+                Change::Revised(_) => None,
+            };
+            if let Some((change, stage)) = passed {
+                released.push(change);
+                waiting[ix].stage = stage;
+            }
+        }
     }
 
     /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of
@@ -193,7 +341,7 @@ impl Stations {
     /// order.
     pub(crate) fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
         let mut released = Vec::new();
-        self.process_queue(false, &mut released);
+        self.process_queue(self.is_final_only, &mut released);
         // Images with earlier stamps have already been decided by the join.
         let settled_until = newest.plus_secs(-self.max_wait_secs);
         if self.search.is_none() && self.is_overdue(settled_until) {
@@ -219,6 +367,8 @@ impl Stations {
     /// queued changes in order.
     pub(crate) fn restart(&mut self) -> Vec<Change> {
         let released = self.finish();
+        self.tracking = DepthTracking::new();
+        self.map_from_tracked = Some(Transform::identity());
         self.station = None;
         self.world_from_base = Transform::identity();
         self.map_from_odom = Transform::identity();
@@ -228,6 +378,7 @@ impl Stations {
     /// Corrects all keyframes of a recording and returns them in the same order.
     #[must_use]
     pub fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
+        self.is_final_only = true;
         let mut released: Vec<Change> = Vec::new();
         for keyframe in keyframes {
             released.extend(self.push(Change::Accepted(keyframe)));
@@ -240,15 +391,23 @@ impl Stations {
     /// base pose.
     pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
         if self.carried.contains(camera) {
-            self.map_from_odom * world_from_camera
+            self.map_from_odom() * world_from_camera
         } else {
             *world_from_camera
         }
     }
 
-    /// The current correction of reported base poses.
+    /// The current correction of reported base poses. It is provisional while keyframes wait for
+    /// their station.
     pub(crate) fn map_from_odom(&self) -> Transform {
-        self.map_from_odom
+        let tracked = if self.held.is_empty() {
+            None
+        } else {
+            self.map_from_tracked
+                .zip(self.tracking.tracked_from_odom())
+                .map(|(map_from_tracked, tracked_from_odom)| map_from_tracked * tracked_from_odom)
+        };
+        tracked.unwrap_or(self.map_from_odom)
     }
 
     /// Reports on all stations after the first.
@@ -286,47 +445,41 @@ impl Stations {
             if self.search.is_some() {
                 return;
             }
-            let Some(change) = self.queue.pop_front() else {
+            let Some(waiting) = self.queue.pop_front() else {
                 return;
             };
-            self.take(change, released);
+            self.take(waiting, released);
         }
     }
 
-    fn take(&mut self, change: Change, released: &mut Vec<Change>) {
+    fn take(&mut self, waiting: Waiting, released: &mut Vec<Change>) {
         // If a keyframe shows that the scan is over, registration starts without this keyframe. The
         // keyframe is put back and belongs to the next group. If no more keyframes arrive,
         // `advance_to` ends the scan after a time limit.
-        let ends_group = match &change {
-            Change::Accepted(keyframe) => {
-                self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
-            }
-            Change::Evicted { .. } => false,
-        };
+        let keyframe = waiting.keyframe().cloned();
+        let ends_group = keyframe.as_ref().is_some_and(|keyframe| {
+            self.is_overdue(keyframe.stamp) || self.leaves_station(keyframe)
+        });
         if ends_group {
             self.start_search(released);
-            self.queue.push_front(change);
+            self.queue.push_front(waiting);
             return;
         }
-        match change {
-            // If no keyframes are queued, keyframes of the current station pass at once. While an
-            // arm scans from one place, its keyframes are therefore trained without delay.
-            Change::Accepted(keyframe)
-                if self.held.is_empty() && self.is_at_current_station(&keyframe) =>
-            {
-                released.push(Change::Accepted(self.placed(keyframe)));
-            }
-            // An eviction must not overtake the keyframe that it evicts, so it waits behind the
-            // queued keyframes.
-            change if self.held.is_empty() && matches!(change, Change::Evicted { .. }) => {
-                released.push(change)
-            }
-            change => {
-                self.held.push(change);
-                if self.is_group_complete() || self.held.len() >= MAX_HELD {
-                    self.start_search(released);
-                }
-            }
+        // If no keyframes are queued, keyframes of the current station pass at once. While an arm
+        // scans from one place, its keyframes are therefore trained without delay. An eviction must
+        // not overtake the keyframe that it evicts, so it waits behind the queued keyframes.
+        let is_settled = self.held.is_empty()
+            && keyframe
+                .as_ref()
+                .is_none_or(|keyframe| self.is_at_current_station(keyframe));
+        if is_settled {
+            let placed = keyframe.map(|keyframe| self.placed(keyframe));
+            released.extend(waiting.settled(placed));
+            return;
+        }
+        self.held.push(waiting);
+        if self.is_group_complete() || self.held.len() >= MAX_HELD {
+            self.start_search(released);
         }
     }
 
@@ -377,10 +530,8 @@ impl Stations {
     }
 
     fn held_keyframes(&self) -> impl Iterator<Item = &Keyframe> {
-        self.held.iter().filter_map(|change| match change {
-            Change::Accepted(keyframe) => Some(keyframe.as_ref()),
-            Change::Evicted { .. } => None,
-        })
+        let keyframes = self.held.iter().filter_map(Waiting::keyframe);
+        keyframes.map(AsRef::as_ref)
     }
 
     /// The queued keyframes of the next station.
@@ -392,37 +543,60 @@ impl Stations {
     /// Starts to register the next station. If no queued keyframe is at a station, passes them with
     /// the current correction.
     fn start_search(&mut self, released: &mut Vec<Change>) {
-        let guess = self.map_from_odom;
+        let before = self.map_from_odom;
         let Some(base_state) = self
             .group()
             .next()
             .and_then(|keyframe| keyframe.base.clone())
         else {
-            for change in std::mem::take(&mut self.held) {
-                released.push(corrected(change, |_| guess));
+            for waiting in std::mem::take(&mut self.held) {
+                let tracked = self.map_from_tracked.zip(waiting.tracked_from_odom);
+                let correction = tracked.map_or(before, |(map, tracked)| map * tracked);
+                let keyframe = waiting.keyframe().map(|of| corrected(of, |_| correction));
+                released.extend(waiting.settled(keyframe));
             }
             return;
         };
-        // Registration starts from the current correction, because the drift since the last station
-        // is much smaller than the drift since the start.
+        // Registration compares with the current correction, because the drift since the last
+        // station is much smaller than the drift since the start. It begins at the result of depth
+        // tracking, which is closer.
+        let initial_motion = self
+            .tracked_at_group()
+            .map_or_else(Transform::identity, |tracked| tracked * before.inverse());
         let new: Vec<Arc<Keyframe>> = self
             .group()
             .filter(|keyframe| is_usable(keyframe))
-            .map(|keyframe| Arc::new(keyframe.with_base_correction(&guess)))
+            .map(|keyframe| Arc::new(keyframe.with_base_correction(&before)))
             .collect();
         // The task gets copies (of `Arc`s), so that keyframes can be queued while it runs.
         let reference_keyframes = self.reference_keyframes.clone();
-        let world_from_base = guess * base_state.world_from_base;
+        let world_from_base = before * base_state.world_from_base;
         self.search = Some(Task::start("station", move || {
             let started = Instant::now();
             let correction = run_in_background_pool(|| {
-                register_station(&reference_keyframes, &new, &world_from_base)
+                register_station(
+                    &reference_keyframes,
+                    &new,
+                    &world_from_base,
+                    &initial_motion,
+                )
             });
             SearchResult {
                 correction,
                 took: started.elapsed(),
             }
         }));
+    }
+
+    /// The correction by depth tracking at the station of the queued keyframes.
+    fn tracked_at_group(&self) -> Option<Transform> {
+        let at_station = |waiting: &&Waiting| {
+            let keyframe = waiting.keyframe();
+            keyframe.is_some_and(|keyframe| station_of(keyframe).is_some())
+        };
+        // The last one has seen most of the station.
+        let last = self.held.iter().rev().find(at_station)?;
+        Some(self.map_from_tracked? * last.tracked_from_odom?)
     }
 
     /// Passes the queued keyframes on with the correction that registration estimated.
@@ -442,33 +616,44 @@ impl Stations {
             left: self.world_from_base,
             arrived: base_state.world_from_base,
             before,
+            tracked: self.tracked_at_group(),
             estimated: correction.as_ref(),
         };
-        let now = correction_change.at(&base_state.world_from_base, 1.0);
+        let now = correction_change.at_arrival();
         // The report counts the keyframes of the group, so it is made before the keyframes are
         // taken out.
         let report = StationReport::new(
             &base_state,
             [&before, &now],
             self.group().filter(|of| is_usable(of)).count(),
-            correction.as_ref(),
+            &correction_change,
         );
         log::info!("{report}");
         self.reported.push(report);
-        let held: Vec<Change> = std::mem::take(&mut self.held)
-            .into_iter()
-            .map(|held| corrected(held, |at| correction_change.of(at)))
-            .collect();
+        let map_from_tracked = self.map_from_tracked;
+        let held = std::mem::take(&mut self.held);
+        // Later keyframes begin with what registration has found.
+        if let Some(last) = held
+            .iter()
+            .rev()
+            .find_map(|waiting| waiting.tracked_from_odom)
+        {
+            self.map_from_tracked = Some(now * last.inverse());
+        }
         self.station = base_state.station;
         self.world_from_base = base_state.world_from_base;
         self.map_from_odom = now;
-        // Keyframes of this station become references for later ones, with their corrected poses.
-        for change in &held {
-            if let Change::Accepted(keyframe) = change {
-                self.add_reference(keyframe);
-            }
+        for waiting in held {
+            let tracked = map_from_tracked.zip(waiting.tracked_from_odom);
+            let tracked = tracked.map(|(map, tracked)| map * tracked);
+            let keyframe = waiting
+                .keyframe()
+                .map(|of| corrected(of, |at| correction_change.of(at, tracked)));
+            // Keyframes of this station become references for later ones, with their corrected
+            // poses.
+            keyframe.iter().for_each(|of| self.add_reference(of));
+            released.extend(waiting.settled(keyframe));
         }
-        released.extend(held);
     }
 
     /// Corrects a keyframe of the current station.
@@ -505,7 +690,7 @@ impl Stations {
 fn accepted_keyframe(change: Change) -> Option<Arc<Keyframe>> {
     match change {
         Change::Accepted(keyframe) => Some(keyframe),
-        Change::Evicted { .. } => None,
+        Change::Revised(_) | Change::Evicted { .. } => None,
     }
 }
 
@@ -536,13 +721,13 @@ fn carried(keyframe: &Arc<Keyframe>, map_from_odom: &Transform) -> Arc<Keyframe>
     }
 }
 
-fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Change {
-    match change {
-        Change::Accepted(keyframe) => Change::Accepted(match &keyframe.base {
-            Some(base_state) => carried(&keyframe, &correction(base_state)),
-            None => keyframe,
-        }),
-        Change::Evicted { .. } => change,
+fn corrected(
+    keyframe: &Arc<Keyframe>,
+    correction: impl Fn(&BaseState) -> Transform,
+) -> Arc<Keyframe> {
+    match &keyframe.base {
+        Some(base_state) => carried(keyframe, &correction(base_state)),
+        None => Arc::clone(keyframe),
     }
 }
 
@@ -551,17 +736,20 @@ impl StationReport {
         base_state: &BaseState,
         [before, after]: [&Transform; 2],
         n_keyframes: usize,
-        correction: Option<&StationCorrection>,
+        change: &CorrectionChange<'_>,
     ) -> Self {
+        let reported = base_state.world_from_base;
         let base_error = base_state.truth.map(|truth| {
-            [before, after].map(|map_from_odom| {
-                PoseDistance::between(&(map_from_odom * base_state.world_from_base), &truth)
-            })
+            [before, after]
+                .map(|map_from_odom| PoseDistance::between(&(map_from_odom * reported), &truth))
         });
         Self {
             station: base_state.station.unwrap_or_default(),
             n_keyframes,
-            correction: correction.cloned(),
+            correction: change.estimated.cloned(),
+            tracked: change
+                .tracked
+                .map(|tracked| PoseDistance::between(&(tracked * reported), &(before * reported))),
             base_error,
         }
     }
@@ -570,22 +758,30 @@ impl StationReport {
 impl std::fmt::Display for StationReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "base at station {}: ", self.station)?;
+        let kept = match self.tracked {
+            Some(_) => "the correction by depth tracking",
+            None => "the previous correction",
+        };
         match &self.correction {
-            None => f.write_str(
-                "its images do not overlap with earlier ones; the previous correction is kept",
+            None => write!(
+                f,
+                "its images do not overlap with earlier ones; {kept} is kept"
             )?,
             Some(correction) if correction.kept => write!(f, "{correction}")?,
             // With fewer images, the uncertainty of the gain is unknown.
             Some(correction) if correction.n_validation_images < MIN_VALIDATION_IMAGES => write!(
                 f,
-                "the previous correction is kept, because this one can be checked on {} only, and {MIN_VALIDATION_IMAGES} are needed: \
+                "{kept} is kept, because this one can be checked on {} only, and {MIN_VALIDATION_IMAGES} are needed: \
                  {correction}",
                 counted(correction.n_validation_images as u64, "validation image")
             )?,
             Some(correction) => write!(
                 f,
-                "the previous correction is kept, as this one is uncertain or not significant: {correction}"
+                "{kept} is kept, as this one is uncertain or not significant: {correction}"
             )?,
+        }
+        if let Some(tracked) = self.tracked {
+            write!(f, "; depth tracking moved it by {tracked}")?;
         }
         for unobservable in self
             .correction
@@ -598,406 +794,5 @@ impl std::fmt::Display for StationReport {
             write!(f, "; error {before} before, {after} after")?;
         }
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use keyframe::DepthMap;
-    use nalgebra::Vector3;
-
-    /// A room corner with textured walls, rendered from a camera pose: brightness and depth.
-    fn render_room(pose: &Transform) -> (Vec<u8>, Vec<f32>) {
-        let (mut rgba, mut depth_m) = (Vec::new(), Vec::new());
-        let origin = pose.translation.vector;
-        for pixel in 0..SIZE_PX[0] * SIZE_PX[1] {
-            let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|px| f64::from(px) + 0.5);
-            let direction =
-                pose.rotation * Vector3::new((x - 80.0) / FOCAL_PX, (y - 60.0) / FOCAL_PX, 1.0);
-            let walls = [
-                (Vector3::x(), 2.0),
-                (Vector3::y(), 1.1),
-                (-Vector3::y(), 1.2),
-                (Vector3::new(0.3, 0.2, -1.0), 0.9),
-            ];
-            let depth_along = |(normal, offset): &(Vector3<f64>, f64)| {
-                let z = (offset - normal.dot(&origin)) / normal.dot(&direction);
-                if z > 0.0 { z } else { f64::INFINITY }
-            };
-            let z = walls.iter().map(depth_along).fold(f64::INFINITY, f64::min);
-            let at = origin + direction * z;
-            let wave =
-                |size: f64, x: f64, y: f64, z: f64| size * (x * at.x + y * at.y + z * at.z).sin();
-            let level = 128.0
-                + wave(30.0, 9.0, 13.0, -8.0)
-                + wave(30.0, -6.0, 7.0, 15.0)
-                + wave(25.0, 4.0, -5.0, 3.0);
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "a gray level in a test"
-            )]
-            let level = level.round() as u8;
-            rgba.extend([level, level, level, 255]);
-            #[expect(clippy::cast_possible_truncation, reason = "meters in a test")]
-            depth_m.push(if z.is_finite() { z as f32 } else { 0.0 });
-        }
-        (rgba, depth_m)
-    }
-
-    const SIZE_PX: [u32; 2] = [160, 120];
-    const FOCAL_PX: f64 = 120.0;
-
-    /// True base pose: at one station, on the way, at another station.
-    fn true_base(fraction: f64) -> Transform {
-        Transform::new(
-            Vector3::new(0.5 * fraction, 0.1 * fraction, 0.0),
-            Vector3::new(0.0, 0.0, 0.15 * fraction),
-        )
-    }
-
-    /// Error of the reported base pose, which grows on the way.
-    fn reported_base(fraction: f64) -> Transform {
-        let truth = true_base(fraction);
-        let rotation = nalgebra::UnitQuaternion::from_scaled_axis(
-            Vector3::new(0.003, -0.004, 0.014) * fraction,
-        );
-        Transform::from_parts(
-            (truth.translation.vector + Vector3::new(0.012, -0.015, 0.005) * fraction).into(),
-            rotation * truth.rotation,
-        )
-    }
-
-    /// The `ix`-th keyframe at 2 Hz: ten seconds at a station, three on the way, ten at the next
-    /// station.
-    fn keyframe(ix: usize) -> Arc<Keyframe> {
-        let (station, fraction) = match ix {
-            0..24 => (Some(0), 0.0),
-            24..30 => (None, (ix as f64 - 23.0) / 7.0),
-            _ => (Some(1), 1.0),
-        };
-        let wave = |hz: f64, phase: f64| (hz * ix as f64 + phase).sin();
-        let base_from_camera = Transform::from_parts(
-            Vector3::new(
-                0.15 * wave(0.9, 0.0),
-                0.2 * wave(0.7, 1.0),
-                0.3 + 0.1 * wave(0.5, 2.0),
-            )
-            .into(),
-            nalgebra::UnitQuaternion::from_scaled_axis(Vector3::z() * (0.4 * wave(0.8, 0.5)))
-                * nalgebra::UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[
-                    -Vector3::y(),
-                    -Vector3::z(),
-                    Vector3::x(),
-                ])),
-        );
-        let (rgba, depth_m) = render_room(&(true_base(fraction) * base_from_camera));
-        let world_from_camera = reported_base(fraction) * base_from_camera;
-        let lens = ([FOCAL_PX; 2], [80.0, 60.0]);
-        Arc::new(Keyframe {
-            camera: "wrist".into(),
-            stamp: Stamp::from_secs(0.5 * ix as f64),
-            size_px: SIZE_PX,
-            focal_px: lens.0,
-            principal_px: lens.1,
-            rgba_srgb: rgba.into(),
-            depth: Some(DepthMap {
-                size_px: SIZE_PX,
-                focal_px: lens.0,
-                principal_px: lens.1,
-                depth_m: depth_m.into(),
-                world_from_camera,
-            }),
-            world_from_camera,
-            twist: None,
-            readout_secs: 0.0,
-            joint_twists: [].into(),
-            base: Some(BaseState {
-                station,
-                world_from_base: reported_base(fraction),
-                map_from_odom: Transform::identity(),
-                truth: Some(true_base(fraction)),
-            }),
-            split: Split::of(ix),
-            truth: None,
-            robot: None,
-        })
-    }
-
-    fn all() -> Vec<Arc<Keyframe>> {
-        (0..54).map(keyframe).collect()
-    }
-
-    fn stations() -> Stations {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/mobile-arm.toml");
-        Stations::new(&Rig::load(&path, &[]).unwrap()).expect("its base moves")
-    }
-
-    /// Error of a keyframe's base pose, millimeters and degrees.
-    fn base_error(keyframe: &Keyframe) -> (f64, f64) {
-        let base_state = keyframe.base.as_ref().unwrap();
-        let base = base_state.map_from_odom * base_state.world_from_base;
-        let left = base_state.truth.unwrap().inverse() * base;
-        (
-            1e3 * left.translation.vector.norm(),
-            left.rotation.angle().to_degrees(),
-        )
-    }
-
-    fn bits(keyframes: &[Arc<Keyframe>]) -> Vec<String> {
-        let shown = |keyframe: &Arc<Keyframe>| {
-            format!(
-                "{:?} {:?} {:?}",
-                keyframe.stamp, keyframe.world_from_camera, keyframe.base
-            )
-        };
-        keyframes.iter().map(shown).collect()
-    }
-
-    #[test]
-    fn reason_of_a_rejection_is_stated() {
-        let report = |n_validation_images: usize, kept: bool| {
-            let correction = StationCorrection {
-                translation_m: [0.01, 0.0, 0.0],
-                translation_sigma_m: [0.001; 3],
-                rotation_rad: [0.0; 3],
-                rotation_sigma_rad: [0.001; 3],
-                unobservable: Vec::new(),
-                gain_db: 1.0,
-                standard_error_db: 0.1,
-                n_validation_images,
-                n_pairs: 20,
-                kept,
-            };
-            StationReport {
-                station: 2,
-                n_keyframes: 30,
-                correction: Some(correction),
-                base_error: None,
-            }
-            .to_string()
-        };
-        let too_few = report(MIN_VALIDATION_IMAGES - 1, false);
-        assert!(
-            too_few.contains("can be checked on 3 validation images only, and 4 are needed")
-                && !too_few.contains("not significant"),
-            "{too_few}"
-        );
-        let one = report(1, false);
-        assert!(one.contains("on 1 validation image only"), "{one}");
-        let uncertain = report(MIN_VALIDATION_IMAGES, false);
-        assert!(
-            uncertain.contains("uncertain or not significant"),
-            "{uncertain}"
-        );
-        let kept = report(MIN_VALIDATION_IMAGES, true);
-        assert!(kept.starts_with("base at station 2: moved by"), "{kept}");
-    }
-
-    #[test]
-    fn keyframes_of_a_drifted_station_are_corrected_in_order() {
-        let given = all();
-        let mut stations = stations();
-        let released = stations.corrected(given.clone());
-        let stamps = |keyframes: &[Arc<Keyframe>]| {
-            keyframes
-                .iter()
-                .map(|keyframe| keyframe.stamp)
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(stamps(&given), stamps(&released));
-        assert!(
-            given[..24]
-                .iter()
-                .zip(&released)
-                .all(|(given, released)| Arc::ptr_eq(given, released)),
-            "keyframes of the first station are unchanged"
-        );
-        for (given, released) in given.iter().zip(&released).skip(24) {
-            let ((before_mm, _), (mm, degrees)) = (base_error(given), base_error(released));
-            assert!(
-                mm < 0.5 && degrees < 0.05,
-                "{:?}: {before_mm} mm, now {mm} mm, {degrees}",
-                released.stamp
-            );
-            // Depth is corrected too.
-            let [was, is] = [given, released].map(|of| {
-                of.world_from_camera.inverse() * of.depth.as_ref().unwrap().world_from_camera
-            });
-            assert!((was.to_homogeneous() - is.to_homogeneous()).abs().max() < 1e-9);
-        }
-        let [report] = stations.reports() else {
-            panic!("{:?}", stations.reports())
-        };
-        let [before, after] = report.base_error.unwrap();
-        assert!(
-            report.station == 1 && before.m > 0.019 && after.m < 5e-4 && after.rad < 1e-3,
-            "{report}"
-        );
-        assert!(
-            report
-                .to_string()
-                .starts_with("base at station 1: moved by"),
-            "{report}"
-        );
-        let camera = Transform::translation(0.1, 0.2, 0.3);
-        assert_ne!(stations.corrected_pose("wrist", &camera), camera);
-        assert_eq!(stations.corrected_pose("of the room", &camera), camera);
-    }
-
-    #[test]
-    fn station_is_held_until_its_correction_can_be_checked() {
-        // The first station has one validation image. The 14 usable keyframes with which the next
-        // station could be registered have two. The fourth one is the 20th usable keyframe.
-        let faster = |ix: usize| {
-            Arc::new(Keyframe {
-                stamp: Stamp::from_secs(0.25 * ix as f64),
-                ..(*keyframe(ix)).clone()
-            })
-        };
-        let mut stations = stations();
-        let released = stations.corrected((18..54).map(faster).collect());
-        assert_eq!(released.len(), 36);
-        let [report] = stations.reports() else {
-            panic!("{:?}", stations.reports())
-        };
-        assert_eq!(report.n_keyframes, 20);
-        let n_validation = report.correction.as_ref().map(|of| of.n_validation_images);
-        assert!(n_validation >= Some(MIN_VALIDATION_IMAGES), "{report}");
-    }
-
-    #[test]
-    fn restarted_source_begins_without_a_correction() {
-        let mut stations = stations();
-        let first_round = stations.corrected(all());
-        assert!(base_error(&all()[53]).0 > 15.0 && base_error(&first_round[53]).0 < 0.5);
-        assert!(stations.restart().is_empty(), "nothing is queued");
-        let second_round = stations.corrected(all());
-        assert_eq!(
-            bits(&second_round[..24]),
-            bits(&all()[..24]),
-            "the first station is uncorrected"
-        );
-        assert!(
-            base_error(&second_round[53]).0 < 0.5,
-            "{:?}",
-            base_error(&second_round[53])
-        );
-    }
-
-    #[test]
-    fn incremental_and_batch_correction_agree() {
-        let at_once = stations().corrected(all());
-        for patience in [0.0, 0.05] {
-            let mut stations = stations();
-            let mut released = Vec::new();
-            for keyframe in all() {
-                let stamp = keyframe.stamp;
-                released.extend(stations.push(Change::Accepted(keyframe)));
-                std::thread::sleep(Duration::from_secs_f64(patience));
-                released.extend(stations.advance_to(stamp));
-            }
-            released.extend(stations.finish());
-            let released: Vec<_> = released
-                .into_iter()
-                .filter_map(|change| {
-                    if let Change::Accepted(keyframe) = change {
-                        Some(keyframe)
-                    } else {
-                        None
-                    }
-                })
-                .collect();
-            assert_eq!(bits(&at_once), bits(&released));
-        }
-    }
-
-    #[test]
-    fn held_keyframes_are_released_in_order_after_a_limit() {
-        let mut stations = stations();
-        let count = |released: &[Change]| released.len();
-        for keyframe in all().into_iter().take(24) {
-            assert_eq!(
-                count(&stations.push(Change::Accepted(keyframe))),
-                1,
-                "the first station is not queued"
-            );
-        }
-        let evicted = || Change::Evicted {
-            camera: "wrist".into(),
-            stamp: Stamp(0),
-        };
-        assert_eq!(count(&stations.push(evicted())), 1);
-        assert!(
-            stations.push(Change::Accepted(keyframe(25))).is_empty(),
-            "on the way"
-        );
-        assert!(stations.push(evicted()).is_empty());
-        assert!(stations.advance_to(Stamp::from_secs(30.0)).is_empty());
-        let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_TRAVEL_SECS + 1.0));
-        assert!(
-            matches!(&released[..], [Change::Accepted(_), Change::Evicted { .. }]),
-            "{}",
-            released.len()
-        );
-        // A scan with too few keyframes is registered once it has lasted long enough.
-        for ix in 40..44 {
-            assert!(stations.push(Change::Accepted(keyframe(ix))).is_empty());
-        }
-        let late = Stamp::from_secs(20.0 + MAX_SCAN_SECS + 1.0);
-        let mut released = stations.advance_to(late);
-        while released.is_empty() {
-            std::thread::sleep(Duration::from_millis(10));
-            released = stations.advance_to(late);
-        }
-        assert_eq!((released.len(), stations.reports().len()), (4, 1));
-        let Change::Accepted(keyframe) = &released[0] else {
-            panic!("a keyframe")
-        };
-        assert!(
-            stations.reports()[0]
-                .correction
-                .as_ref()
-                .is_none_or(|correction| !correction.kept || base_error(keyframe).0 < 2.0)
-        );
-    }
-
-    #[test]
-    fn station_without_overlap_is_kept_and_reported() {
-        let away =
-            |keyframe: Arc<Keyframe>| match keyframe.base.as_ref().and_then(|base| base.station) {
-                Some(1) => {
-                    Arc::new(keyframe.with_base_correction(&Transform::translation(90.0, 0.0, 0.0)))
-                }
-                _ => keyframe,
-            };
-        let given: Vec<_> = all().into_iter().map(away).collect();
-        let mut stations = stations();
-        let released = stations.corrected(given.clone());
-        assert_eq!(bits(&given), bits(&released));
-        assert!(
-            stations.reports()[0]
-                .to_string()
-                .contains("do not overlap with earlier ones"),
-            "{}",
-            stations.reports()[0]
-        );
-    }
-
-    #[test]
-    fn only_moving_bases_are_realigned_on_request() {
-        let rig = |name: &str, realign: bool| {
-            let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
-                .join("../rigs")
-                .join(name);
-            Rig::load(
-                &path,
-                &[crate::config::Override::new("base.realign", realign)],
-            )
-            .unwrap()
-        };
-        assert!(Stations::new(&rig("mobile-arm.toml", false)).is_none());
-        assert!(Stations::new(&rig("static-arm.toml", true)).is_none());
     }
 }
