@@ -55,16 +55,10 @@ impl DriftTracker {
         points: &[Point3<f64>],
         world_from_base: &Transform,
     ) -> Option<ScanMatch> {
-        let base = Point3::from(world_from_base.translation.vector);
-        if let Some(last) = self.last {
-            self.covariance = carried(&self.covariance, &last, world_from_base)
-                + drift_covariance(&last, world_from_base);
-        }
-        let found = (!self.map.is_empty())
-            .then(|| match_scan(&self.map, points, &base, &self.covariance))
-            .flatten();
-        let Some(found) = found else {
+        let prior = self.prior(world_from_base);
+        let Some(found) = self.match_with(points, world_from_base, &prior) else {
             self.map.add(points);
+            self.covariance = prior;
             self.last = Some(*world_from_base);
             return None;
         };
@@ -73,6 +67,32 @@ impl DriftTracker {
         self.covariance = found.covariance;
         self.last = Some(found.motion * world_from_base);
         Some(found)
+    }
+
+    /// Matches a scan without adding it. See [`Self::add`].
+    #[must_use]
+    pub fn locate(&self, points: &[Point3<f64>], world_from_base: &Transform) -> Option<ScanMatch> {
+        self.match_with(points, world_from_base, &self.prior(world_from_base))
+    }
+
+    /// Covariance of the correction at a pose of the base, before a match.
+    fn prior(&self, world_from_base: &Transform) -> Matrix6<f64> {
+        self.last.map_or(self.covariance, |last| {
+            carried(&self.covariance, &last, world_from_base)
+                + drift_covariance(&last, world_from_base)
+        })
+    }
+
+    fn match_with(
+        &self,
+        points: &[Point3<f64>],
+        world_from_base: &Transform,
+        prior: &Matrix6<f64>,
+    ) -> Option<ScanMatch> {
+        let base = Point3::from(world_from_base.translation.vector);
+        (!self.map.is_empty())
+            .then(|| match_scan(&self.map, points, &base, prior))
+            .flatten()
     }
 }
 

@@ -4,14 +4,14 @@ use super::is_usable;
 use calibration::{DriftTracker, RangeSensor};
 use keyframe::{DepthMap, Keyframe};
 use kinematics::Transform;
-use nalgebra::{Matrix3, Point3};
+use nalgebra::{Matrix6, Point3};
 
 /// Number of points of each depth image. More points would lie on the same surfaces.
 const N_POINTS: u32 = 2500;
 /// Maximum standard deviations of a correction in any direction, meters and radians. With larger
 /// errors, an image would damage what the model has learned from earlier ones.
-const MAX_SIGMA_M: f64 = 0.004;
-const MAX_SIGMA_RAD: f64 = 0.004;
+const MAX_SIGMA_M: f64 = 0.0015;
+const MAX_SIGMA_RAD: f64 = 0.0015;
 
 /// The correction of the reported base poses according to depth images alone. It is known at once,
 /// but is less accurate than the registration of a station.
@@ -33,28 +33,34 @@ impl DepthTracking {
 
     /// The newest correction; `None` if depth images do not determine it.
     pub(super) fn tracked_from_odom(&self) -> Option<Transform> {
-        let covariance = self.tracker.covariance();
-        let is_below = |block: Matrix3<f64>, max_sigma: f64| {
-            block.symmetric_eigenvalues().max() <= max_sigma * max_sigma
-        };
-        let [translation, rotation] =
-            [0, 3].map(|begin| covariance.fixed_view::<3, 3>(begin, begin).into_owned());
-        let is_known = is_below(translation, MAX_SIGMA_M) && is_below(rotation, MAX_SIGMA_RAD);
-        is_known.then_some(self.tracked_from_odom)
+        is_certain(self.tracker.covariance()).then_some(self.tracked_from_odom)
     }
 
     /// Adds a keyframe with its reported pose. Returns the correction for it.
     pub(super) fn add(&mut self, keyframe: &Keyframe) -> Option<Transform> {
         let base_state = keyframe.base.as_ref()?;
         let world_from_base = self.tracked_from_odom * base_state.world_from_base;
-        // Test keyframes must not influence the poses of other keyframes.
-        let depth = keyframe.depth.as_ref().filter(|_| is_usable(keyframe));
+        let depth = keyframe.depth.as_ref();
         let points = depth.map_or(Vec::new(), |depth| points(depth, &self.tracked_from_odom));
+        if !is_usable(keyframe) {
+            // Test keyframes must not influence the poses of other keyframes.
+            let found = self.tracker.locate(&points, &world_from_base)?;
+            return is_certain(&found.covariance).then_some(found.motion * self.tracked_from_odom);
+        }
         if let Some(found) = self.tracker.add(&points, &world_from_base) {
             self.tracked_from_odom = found.motion * self.tracked_from_odom;
         }
         self.tracked_from_odom()
     }
+}
+
+/// Whether the standard deviations of a correction are small enough in all directions.
+fn is_certain(covariance: &Matrix6<f64>) -> bool {
+    let is_below = |begin: usize, max_sigma: f64| {
+        let block = covariance.fixed_view::<3, 3>(begin, begin).into_owned();
+        block.symmetric_eigenvalues().max() <= max_sigma * max_sigma
+    };
+    is_below(0, MAX_SIGMA_M) && is_below(3, MAX_SIGMA_RAD)
 }
 
 /// Points of a depth image, spread evenly, with corrected poses.

@@ -172,9 +172,10 @@ fn keyframes_pass_at_once_and_are_revised_when_their_station_is_registered() {
         }
         n
     };
+    let mut n_waiting = 0;
     for keyframe in all() {
         let n = sort(stations.push(Change::Accepted(keyframe)));
-        assert!(n >= 1, "no keyframe waits");
+        n_waiting += usize::from(n == 0);
     }
     sort(stations.finish());
     let stamps = |keyframes: &[Arc<Keyframe>]| {
@@ -191,7 +192,12 @@ fn keyframes_pass_at_once_and_are_revised_when_their_station_is_registered() {
         revised.iter().any(|revised| is_same(&revised))
     });
     let (mm, degrees) = worst_error(provisional);
-    assert!(mm < 3.0 && degrees < 0.2, "provisional: {mm} mm, {degrees}");
+    assert!(
+        mm < 1.0 && degrees < 0.05,
+        "provisional: {mm} mm, {degrees}"
+    );
+    // One image on the way shows two walls only.
+    assert!(n_waiting <= 1, "{n_waiting} keyframes wait");
     assert!(revised.len() >= MIN_KEYFRAMES, "{}", revised.len());
     let (mm, degrees) = worst_error(revised.iter());
     assert!(mm < 0.5 && degrees < 0.05, "revised: {mm} mm, {degrees}");
@@ -399,16 +405,16 @@ fn held_keyframes_are_released_in_order_after_a_limit() {
             "the first station is not queued"
         );
     }
-    let evicted = || Change::Evicted {
+    let evicted = |stamp: Stamp| Change::Evicted {
         camera: "wrist".into(),
-        stamp: Stamp(0),
+        stamp,
     };
-    assert_eq!(count(&stations.push(evicted())), 1);
+    assert_eq!(count(&stations.push(evicted(Stamp(0)))), 1);
     assert!(
         stations.push(Change::Accepted(keyframe(25))).is_empty(),
         "on the way"
     );
-    assert!(stations.push(evicted()).is_empty());
+    assert!(stations.push(evicted(keyframe(25).stamp)).is_empty());
     assert!(stations.advance_to(Stamp::from_secs(30.0)).is_empty());
     let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_TRAVEL_SECS + 1.0));
     assert!(
@@ -448,7 +454,12 @@ fn station_without_overlap_is_kept_and_reported() {
     let given: Vec<_> = all().into_iter().map(away).collect();
     let mut stations = stations();
     let released = stations.corrected(given.clone());
-    assert_eq!(bits(&given), bits(&released));
+    // Depth corrects the keyframes on the way, whose images do overlap.
+    let at_stations = |keyframes: &[Arc<Keyframe>]| {
+        let at_station = keyframes.iter().filter(|of| station_of(of).is_some());
+        bits(&at_station.cloned().collect::<Vec<_>>())
+    };
+    assert_eq!(at_stations(&given), at_stations(&released));
     assert!(
         stations.reports()[0]
             .to_string()

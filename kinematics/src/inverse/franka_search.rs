@@ -9,7 +9,7 @@ use super::franka::{Branch, Forearm, FrankaArm, SevenFrame, opposite};
 /// reachable poses of a Panda have a solution at one of their ends.
 const N_INTERVALS: u32 = 16;
 /// Number of levels. Each level halves the intervals of the previous level. At the last level,
-/// values of the last joint are 0.013 rad apart. The few poses without a solution at these values
+/// values of the last joint are 0.011 rad apart. The few poses without a solution at these values
 /// are left to least squares.
 const N_LEVELS: u32 = 6;
 /// Number of values of the last joint that are tested to refine the best one. The cost is nearly a

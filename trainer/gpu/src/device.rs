@@ -11,6 +11,9 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+/// Maximum time until wgpu reports that a device is lost.
+const LOSS_TIMEOUT: Duration = Duration::from_secs(5);
+
 /// Interval between checks of the device while waiting for a read-back. It delays only the
 /// detection of a lost device.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
@@ -338,10 +341,13 @@ impl Gpu {
     pub fn check(&self) -> Result<(), Error> {
         let failed = self.health.failed.get();
         if matches!(failed, Some(Failure::Invalid(_))) && !self.is_lost() {
-            // Commands for a lost device are also invalid, and wgpu may report the loss only when
-            // it is polled.
+            // Commands for a lost device are also invalid. wgpu reports the loss only when it is
+            // polled, and when the submissions that were running have ended.
             let _ = std::panic::catch_unwind(AssertUnwindSafe(|| {
-                self.device.poll(wgpu::PollType::Poll)
+                self.device.poll(wgpu::PollType::Wait {
+                    submission_index: None,
+                    timeout: Some(LOSS_TIMEOUT),
+                })
             }));
         }
         match failed {

@@ -58,7 +58,7 @@ pub(super) struct Attempt {
 }
 
 impl Attempt {
-    /// * `refusal`: the link that refused to move the arm further, and its reason.
+    /// * `refusal`: the link that stopped the arm, and its reason.
     pub(super) fn ended(
         is_reached: bool,
         n_contacts: u64,
@@ -203,18 +203,33 @@ impl SteeredScene {
                 break;
             }
         }
-        let refused = self
+        // An arm also comes to rest if a link slows it down to almost nothing.
+        let remaining_speed = |limit: &&Limit| match limit.effect {
+            Effect::Refused | Effect::Braked => 0.0,
+            Effect::Slowed(scale) => scale,
+        };
+        let ended_by = self
             .limits
             .iter()
-            .find(|limit| limit.effect == Effect::Refused || limit.effect == Effect::Braked)
+            .min_by(|a, b| remaining_speed(a).total_cmp(&remaining_speed(b)))
             .cloned();
         let tip = self.chain.forward(&self.position()?)?;
         let gap = Target::pose(goal).gap(&tip);
+        log::debug!(
+            "goal {}: {:.1} mm and {:.3} rad left; {:?}; {:?}",
+            kind.title(),
+            1e3 * gap.distance_m,
+            gap.angle_rad,
+            self.limits,
+            self.port
+                .state()
+                .map(|state| (state.position, state.is_at_rest)),
+        );
         self.release()?;
         Ok(Attempt::ended(
             gap.distance_m <= REACHED_M && gap.angle_rad <= REACHED_RAD,
             self.opened.n_contacts() - n_before,
-            refused.map(|limit| (limit.link, limit.reason)),
+            ended_by.map(|limit| (limit.link, limit.reason)),
         ))
     }
 

@@ -14,9 +14,10 @@ use std::sync::Arc;
 /// Focal length of an image, pixels. The angle of a pixel, 1.8 degrees, is close to the angle
 /// between the rings of small scanners.
 const FOCAL_PX: f64 = 32.0;
-/// Pixels per side of an image. The images overlap by 3.4 degrees on each side, because the map
-/// frees no space at the border of an image.
-const SIDE_PX: u32 = 72;
+/// Pixels per side of an image. The images overlap by 13 degrees on each side: the map frees a voxel
+/// only if the image contains all of its surroundings, which cover this angle at a distance of
+/// 0.3 m.
+const SIDE_PX: u32 = 104;
 /// Largest number of pixels between two rings. The rings of a scanner with 16 rings over 30 degrees
 /// are 1.2 pixels apart.
 const MAX_GAP_PX: usize = 2;

@@ -8,6 +8,7 @@ use crate::scan::images_of_scan;
 use crate::voxel_map::VoxelMap;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
+use std::f64::consts::FRAC_PI_2;
 use std::sync::Arc;
 use steering::{Footprint, Seen};
 
@@ -20,24 +21,26 @@ const WALL_M: f64 = 0.8;
 /// show, only the space close to a ring is free.
 const SLACK_M: f64 = 0.12;
 
+/// A floor and four walls. Space from which no echo returns would count as unseen.
 fn scene() -> Vec<Solid> {
+    let wall = |center, size_m| Solid::Cuboid { center, size_m };
     vec![
         Solid::Below(FLOOR_Z_M),
-        Solid::Cuboid {
-            center: [WALL_M + 0.5, 0.0, 0.0],
-            size_m: [1.0, 6.0, 4.0],
-        },
+        wall([WALL_M + 0.5, 0.0, 0.0], [1.0, 6.0, 6.0]),
+        wall([-2.5, 0.0, 0.0], [1.0, 6.0, 6.0]),
+        wall([0.0, 2.5, 0.0], [6.0, 1.0, 6.0]),
+        wall([0.0, -2.5, 0.0], [6.0, 1.0, 6.0]),
     ]
 }
 
-/// The points of a scanner with 32 rings over 60 degrees.
+/// The points of a scanner with 48 rings over 90 degrees.
 fn scan() -> Vec<[f64; 3]> {
-    const N_RINGS: u32 = 32;
+    const N_RINGS: u32 = 48;
     const N_COLUMNS: u32 = 720;
     let mut points = Vec::new();
     let solids = scene();
     for ring in 0..N_RINGS {
-        let elevation = (f64::from(ring) / f64::from(N_RINGS - 1) - 0.5) * 1.05;
+        let elevation = (f64::from(ring) / f64::from(N_RINGS - 1) - 0.5) * FRAC_PI_2;
         for column in 0..N_COLUMNS {
             let azimuth = f64::from(column) / f64::from(N_COLUMNS) * std::f64::consts::TAU;
             let direction = Vector3::new(
