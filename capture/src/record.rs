@@ -300,8 +300,9 @@ impl Recorded {
 
     /// Devices of the rig without recorded data.
     fn missing_devices(&self, rig: &Rig) -> Vec<String> {
-        let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0)
-            .then_some("joint state of the arm");
+        // A robot without joints, such as a base, sends no joint states.
+        let has_arm = rig.arm.driver != ArmDriver::None && !rig.arm.joints.is_empty();
+        let arm = (has_arm && self.joint_states == 0).then_some("joint state of the arm");
         let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0)
             .then_some("pose of the base");
         let images = (self.images == 0).then_some("image");
