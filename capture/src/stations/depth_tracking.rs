@@ -10,8 +10,20 @@ use nalgebra::{Matrix6, Point3};
 const N_POINTS: u32 = 2500;
 /// Maximum standard deviations of a correction in any direction, meters and radians. With larger
 /// errors, an image would damage what the model has learned from earlier ones.
-const MAX_SIGMA_M: f64 = 0.0015;
-const MAX_SIGMA_RAD: f64 = 0.0015;
+const MAX_SIGMA_M: f64 = 0.004;
+const MAX_SIGMA_RAD: f64 = 0.004;
+/// Maximum standard deviations of a correction that is more accurate than a share of the correction
+/// of the next station, meters and radians.
+const ACCURATE_M: f64 = 0.0015;
+const ACCURATE_RAD: f64 = 0.0015;
+
+/// A correction by depth tracking.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Tracked {
+    pub(super) from_odom: Transform,
+    /// Whether it is more accurate than a share of the correction of the next station.
+    pub(super) is_accurate: bool,
+}
 
 /// The correction of the reported base poses according to depth images alone. It is known at once,
 /// but is less accurate than the registration of a station.
@@ -32,12 +44,12 @@ impl DepthTracking {
     }
 
     /// The newest correction; `None` if depth images do not determine it.
-    pub(super) fn tracked_from_odom(&self) -> Option<Transform> {
-        is_certain(self.tracker.covariance()).then_some(self.tracked_from_odom)
+    pub(super) fn newest(&self) -> Option<Tracked> {
+        tracked(self.tracked_from_odom, self.tracker.covariance())
     }
 
     /// Adds a keyframe with its reported pose. Returns the correction for it.
-    pub(super) fn add(&mut self, keyframe: &Keyframe) -> Option<Transform> {
+    pub(super) fn add(&mut self, keyframe: &Keyframe) -> Option<Tracked> {
         let base_state = keyframe.base.as_ref()?;
         let world_from_base = self.tracked_from_odom * base_state.world_from_base;
         let depth = keyframe.depth.as_ref();
@@ -45,22 +57,26 @@ impl DepthTracking {
         if !is_usable(keyframe) {
             // Test keyframes must not influence the poses of other keyframes.
             let found = self.tracker.locate(&points, &world_from_base)?;
-            return is_certain(&found.covariance).then_some(found.motion * self.tracked_from_odom);
+            return tracked(found.motion * self.tracked_from_odom, &found.covariance);
         }
         if let Some(found) = self.tracker.add(&points, &world_from_base) {
             self.tracked_from_odom = found.motion * self.tracked_from_odom;
         }
-        self.tracked_from_odom()
+        self.newest()
     }
 }
 
-/// Whether the standard deviations of a correction are small enough in all directions.
-fn is_certain(covariance: &Matrix6<f64>) -> bool {
+/// A correction, if its standard deviations are small enough in all directions.
+fn tracked(from_odom: Transform, covariance: &Matrix6<f64>) -> Option<Tracked> {
     let is_below = |begin: usize, max_sigma: f64| {
         let block = covariance.fixed_view::<3, 3>(begin, begin).into_owned();
         block.symmetric_eigenvalues().max() <= max_sigma * max_sigma
     };
-    is_below(0, MAX_SIGMA_M) && is_below(3, MAX_SIGMA_RAD)
+    let is_known = is_below(0, MAX_SIGMA_M) && is_below(3, MAX_SIGMA_RAD);
+    is_known.then(|| Tracked {
+        from_odom,
+        is_accurate: is_below(0, ACCURATE_M) && is_below(3, ACCURATE_RAD),
+    })
 }
 
 /// Points of a depth image, spread evenly, with corrected poses.

@@ -24,7 +24,7 @@ use crate::join::Change;
 use crate::pose_distance::PoseDistance;
 use background::{Task, run_in_background_pool};
 use calibration::{MIN_VALIDATION_IMAGES, StationCorrection, register_station};
-use depth_tracking::DepthTracking;
+use depth_tracking::{DepthTracking, Tracked};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform, transform};
 use messages::counted;
@@ -92,7 +92,7 @@ pub struct Stations {
 struct Waiting {
     change: Change,
     /// The correction by depth tracking; `None` if depth does not determine it.
-    tracked_from_odom: Option<Transform>,
+    tracked: Option<Tracked>,
     stage: Stage,
 }
 
@@ -274,13 +274,13 @@ impl Stations {
 
     /// Processes a change. Returns the changes that can be passed on, in order.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
-        let tracked_from_odom = match &change {
+        let tracked = match &change {
             Change::Accepted(keyframe) => self.tracking.add(keyframe),
             Change::Revised(_) | Change::Evicted { .. } => None,
         };
         self.queue.push_back(Waiting {
             change,
-            tracked_from_odom,
+            tracked,
             stage: Stage::Queued,
         });
         let mut released = Vec::new();
@@ -304,9 +304,9 @@ impl Stations {
                     Some((Change::Accepted(Arc::clone(keyframe)), Stage::Done))
                 }
                 Change::Accepted(keyframe) => {
-                    let correction = self.map_from_tracked.zip(waiting[ix].tracked_from_odom);
-                    correction.map(|(map_from_tracked, tracked_from_odom)| {
-                        let keyframe = carried(keyframe, &(map_from_tracked * tracked_from_odom));
+                    let correction = provisional(self.map_from_tracked, waiting[ix].tracked);
+                    correction.map(|correction| {
+                        let keyframe = carried(keyframe, &correction);
                         (Change::Accepted(keyframe), Stage::Provisional)
                     })
                 }
@@ -400,14 +400,8 @@ impl Stations {
     /// The current correction of reported base poses. It is provisional while keyframes wait for
     /// their station.
     pub(crate) fn map_from_odom(&self) -> Transform {
-        let tracked = if self.held.is_empty() {
-            None
-        } else {
-            self.map_from_tracked
-                .zip(self.tracking.tracked_from_odom())
-                .map(|(map_from_tracked, tracked_from_odom)| map_from_tracked * tracked_from_odom)
-        };
-        tracked.unwrap_or(self.map_from_odom)
+        let tracked = self.tracking.newest().filter(|_| !self.held.is_empty());
+        provisional(self.map_from_tracked, tracked).unwrap_or(self.map_from_odom)
     }
 
     /// Reports on all stations after the first.
@@ -550,8 +544,8 @@ impl Stations {
             .and_then(|keyframe| keyframe.base.clone())
         else {
             for waiting in std::mem::take(&mut self.held) {
-                let tracked = self.map_from_tracked.zip(waiting.tracked_from_odom);
-                let correction = tracked.map_or(before, |(map, tracked)| map * tracked);
+                let correction =
+                    provisional(self.map_from_tracked, waiting.tracked).unwrap_or(before);
                 let keyframe = waiting.keyframe().map(|of| corrected(of, |_| correction));
                 released.extend(waiting.settled(keyframe));
             }
@@ -596,7 +590,7 @@ impl Stations {
         };
         // The last one has seen most of the station.
         let last = self.held.iter().rev().find(at_station)?;
-        Some(self.map_from_tracked? * last.tracked_from_odom?)
+        provisional(self.map_from_tracked, last.tracked)
     }
 
     /// Passes the queued keyframes on with the correction that registration estimated.
@@ -633,19 +627,15 @@ impl Stations {
         let map_from_tracked = self.map_from_tracked;
         let held = std::mem::take(&mut self.held);
         // Later keyframes begin with what registration has found.
-        if let Some(last) = held
-            .iter()
-            .rev()
-            .find_map(|waiting| waiting.tracked_from_odom)
-        {
-            self.map_from_tracked = Some(now * last.inverse());
+        if let Some(last) = held.iter().rev().find_map(|waiting| waiting.tracked) {
+            self.map_from_tracked = Some(now * last.from_odom.inverse());
         }
         self.station = base_state.station;
         self.world_from_base = base_state.world_from_base;
         self.map_from_odom = now;
         for waiting in held {
-            let tracked = map_from_tracked.zip(waiting.tracked_from_odom);
-            let tracked = tracked.map(|(map, tracked)| map * tracked);
+            let accurate = waiting.tracked.filter(|tracked| tracked.is_accurate);
+            let tracked = provisional(map_from_tracked, accurate);
             let keyframe = waiting
                 .keyframe()
                 .map(|of| corrected(of, |at| correction_change.of(at, tracked)));
@@ -684,6 +674,11 @@ impl Stations {
                 .retain(|_| ixs.next().is_some_and(|ix| ix % 2 == 0));
         }
     }
+}
+
+/// The correction of reported poses by depth tracking, with what registration has added.
+fn provisional(map_from_tracked: Option<Transform>, tracked: Option<Tracked>) -> Option<Transform> {
+    Some(map_from_tracked? * tracked?.from_odom)
 }
 
 /// The keyframe of a change that adds one.

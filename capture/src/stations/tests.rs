@@ -192,12 +192,9 @@ fn keyframes_pass_at_once_and_are_revised_when_their_station_is_registered() {
         revised.iter().any(|revised| is_same(&revised))
     });
     let (mm, degrees) = worst_error(provisional);
-    assert!(
-        mm < 1.0 && degrees < 0.05,
-        "provisional: {mm} mm, {degrees}"
-    );
     // One image on the way shows two walls only.
-    assert!(n_waiting <= 1, "{n_waiting} keyframes wait");
+    assert!(mm < 4.0 && degrees < 0.1, "provisional: {mm} mm, {degrees}");
+    assert_eq!(n_waiting, 0, "no keyframe waits");
     assert!(revised.len() >= MIN_KEYFRAMES, "{}", revised.len());
     let (mm, degrees) = worst_error(revised.iter());
     assert!(mm < 0.5 && degrees < 0.05, "revised: {mm} mm, {degrees}");
@@ -388,7 +385,10 @@ fn incremental_and_batch_correction_agree() {
             released.extend(stations.advance_to(stamp));
         }
         released.extend(stations.finish());
-        assert_eq!(bits(&at_once), bits(&last_poses(released)));
+        let mut last = last_poses(released);
+        // Keyframes whose depth determines no correction pass later.
+        last.sort_by_key(|keyframe| keyframe.stamp);
+        assert_eq!(bits(&at_once), bits(&last));
     }
 }
 

@@ -199,9 +199,11 @@ fn a_preview_shows_images_the_robot_and_devices_but_no_model() {
     wait_for(&mut browser, "the view from above", |browser| {
         n_robot_px(browser) > MIN_ROBOT_PX
     });
+    let requested = hub.pictures().next_request();
     assert!(
-        hub.pictures().next_request().is_none(),
-        "the page requests pictures, but a preview has no model"
+        requested.is_none(),
+        "a preview has no model, but the page requests {:?}",
+        requested.map(|pending| pending.request)
     );
 
     // The missing camera was plugged in, and is slow.
