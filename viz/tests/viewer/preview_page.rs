@@ -203,7 +203,7 @@ fn a_preview_shows_images_the_robot_and_devices_but_no_model() {
     assert!(
         requested.is_none(),
         "a preview has no model, but the page requests {:?}",
-        requested.map(|pending| pending.request)
+        requested.as_ref().map(|pending| &pending.request)
     );
 
     // The missing camera was plugged in, and is slow.
