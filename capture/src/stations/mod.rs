@@ -72,7 +72,7 @@ pub struct Stations {
     reference_keyframes: Vec<Arc<Keyframe>>,
     /// Follows the drift between the stations.
     tracking: DepthTracking,
-    /// What registration has added to the correction by depth tracking. `None` if it is unknown,
+    /// Difference between registration and depth tracking. `None` if it is unknown, for example
     /// because the run continues an earlier one.
     map_from_tracked: Option<Transform>,
     /// Queued keyframes on the way to the next station and at it, in order.
@@ -96,13 +96,13 @@ struct Waiting {
     stage: Stage,
 }
 
-/// What has become of a waiting change.
+/// Progress of a waiting change.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Stage {
     /// It has not passed.
     Queued,
-    /// It is a keyframe, and has passed with a provisional correction.
-    Provisional,
+    /// It is a keyframe, and has passed with this provisional correction.
+    Provisional(Transform),
     /// It has passed, and nothing follows.
     Done,
 }
@@ -115,11 +115,16 @@ impl Waiting {
         }
     }
 
-    /// What is left to pass on, if `corrected` is the keyframe with its final correction.
+    /// The change that must still be passed on. `corrected`: the keyframe with its final
+    /// correction.
     fn settled(self, corrected: Option<Arc<Keyframe>>) -> Option<Change> {
         match (self.stage, corrected) {
             (Stage::Done, _) => None,
-            (Stage::Provisional, Some(keyframe)) => Some(Change::Revised(keyframe)),
+            (Stage::Provisional(correction), Some(keyframe)) => {
+                let base_state = keyframe.base.as_ref();
+                let is_final = base_state.is_some_and(|of| of.map_from_odom == correction);
+                (!is_final).then_some(Change::Revised(keyframe))
+            }
             (_, Some(keyframe)) => Some(Change::Accepted(keyframe)),
             (_, None) => Some(self.change),
         }
@@ -155,10 +160,14 @@ impl CorrectionChange<'_> {
         // If the base has not moved yet, it has not drifted. The condition also avoids 0 / 0.
         let fraction = if from > 0.0 { from / (from + to) } else { 0.0 };
         match (tracked, self.tracked) {
-            // What depth tracking has missed until the arrival accumulates in the same way.
+            // The remaining error of depth tracking also grows in proportion to the distance.
             (Some(tracked), Some(at_arrival)) => {
                 let missed = self.at_arrival() * at_arrival.inverse();
                 transform::interpolate(&Transform::identity(), &missed, fraction) * tracked
+            }
+            (None, Some(at_arrival)) if !self.is_estimated() => {
+                let found = at_arrival * self.before.inverse();
+                transform::interpolate(&Transform::identity(), &found, fraction) * self.before
             }
             _ => self.estimated(&at.world_from_base, fraction),
         }
@@ -166,11 +175,15 @@ impl CorrectionChange<'_> {
 
     /// The correction at the new station.
     fn at_arrival(&self) -> Transform {
-        let is_estimated = self.estimated.is_some_and(|estimated| estimated.kept);
         match self.tracked {
-            Some(tracked) if !is_estimated => tracked,
+            Some(tracked) if !self.is_estimated() => tracked,
             _ => self.estimated(&self.arrived, 1.0),
         }
+    }
+
+    /// Whether the correction by registration is used.
+    fn is_estimated(&self) -> bool {
+        self.estimated.is_some_and(|estimated| estimated.kept)
     }
 
     /// The correction by registration at a reported base pose that lies at this fraction of the
@@ -291,8 +304,8 @@ impl Stations {
         released
     }
 
-    /// Passes on what need not wait: keyframes whose depth determines the drift of the base, and
-    /// keyframes of cameras that do not move with the base.
+    /// Passes changes that can pass before registration: keyframes whose depth determines the drift
+    /// of the base, and keyframes of cameras that do not move with the base.
     fn pass_provisionally(&mut self, released: &mut Vec<Change>) {
         let mut waiting: Vec<&mut Waiting> = self.held.iter_mut().chain(&mut self.queue).collect();
         for ix in 0..waiting.len() {
@@ -307,7 +320,7 @@ impl Stations {
                     let correction = provisional(self.map_from_tracked, waiting[ix].tracked);
                     correction.map(|correction| {
                         let keyframe = carried(keyframe, &correction);
-                        (Change::Accepted(keyframe), Stage::Provisional)
+                        (Change::Accepted(keyframe), Stage::Provisional(correction))
                     })
                 }
                 Change::Evicted { camera, stamp } => {
@@ -346,6 +359,9 @@ impl Stations {
         let settled_until = newest.plus_secs(-self.max_wait_secs);
         if self.search.is_none() && self.is_overdue(settled_until) {
             self.start_search(&mut released);
+        }
+        if !self.is_final_only {
+            self.pass_provisionally(&mut released);
         }
         released
     }
@@ -588,7 +604,7 @@ impl Stations {
             let keyframe = waiting.keyframe();
             keyframe.is_some_and(|keyframe| station_of(keyframe).is_some())
         };
-        // The last one has seen most of the station.
+        // The last keyframe is matched with the largest part of the station.
         let last = self.held.iter().rev().find(at_station)?;
         provisional(self.map_from_tracked, last.tracked)
     }
@@ -626,9 +642,11 @@ impl Stations {
         self.reported.push(report);
         let map_from_tracked = self.map_from_tracked;
         let held = std::mem::take(&mut self.held);
-        // Later keyframes begin with what registration has found.
-        if let Some(last) = held.iter().rev().find_map(|waiting| waiting.tracked) {
-            self.map_from_tracked = Some(now * last.from_odom.inverse());
+        // Later provisional corrections include the result of registration.
+        match held.iter().rev().find_map(|waiting| waiting.tracked) {
+            Some(last) => self.map_from_tracked = Some(now * last.from_odom.inverse()),
+            None if now != before => self.map_from_tracked = None,
+            None => {}
         }
         self.station = base_state.station;
         self.world_from_base = base_state.world_from_base;
@@ -676,7 +694,8 @@ impl Stations {
     }
 }
 
-/// The correction of reported poses by depth tracking, with what registration has added.
+/// The provisional correction of reported poses: by depth tracking, and its difference from
+/// registration.
 fn provisional(map_from_tracked: Option<Transform>, tracked: Option<Tracked>) -> Option<Transform> {
     Some(map_from_tracked? * tracked?.from_odom)
 }
