@@ -212,7 +212,8 @@ mod tests {
             nalgebra::Vector3::new(0.001, 0.002, -0.004),
         );
         let revised = Arc::new(recorded.with_base_correction(&revision));
-        let (found, others) = match_keyframes(&expected, &[revised.clone()]).expect("a match");
+        let (found, others) =
+            match_keyframes(&expected, std::slice::from_ref(&revised)).expect("a match");
         assert!(others.is_empty());
         assert_eq!(
             KeyframeSignature::of(&found[0]).world_from_camera,
