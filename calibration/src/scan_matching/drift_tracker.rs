@@ -28,7 +28,7 @@ pub struct DriftTracker {
 }
 
 impl DriftTracker {
-    /// A tracker that has seen nothing yet.
+    /// A tracker without a scan.
     #[must_use]
     pub fn new(sensor: RangeSensor) -> Self {
         Self {

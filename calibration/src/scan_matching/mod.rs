@@ -1,10 +1,10 @@
 //! Matching of range scans and depth images with the surfaces that earlier ones have measured.
 //!
-//! Odometry drifts, but the walls of a room do not. Each scan or depth image is moved so that its points lie on
-//! the planes of a [`SurfaceMap`] (point to plane, Chen and Medioni 1992; planes in cells as in
-//! `VoxelMap`, Yuan et al. 2022). The pose from odometry is the prior, with a covariance that grows
-//! with the distance traveled. A direction that the surfaces do not determine, such as that along a
-//! corridor, therefore follows odometry.
+//! Odometry drifts, but the walls of a room do not. Each scan or depth image is moved so that its
+//! points lie on the planes of a [`SurfaceMap`] (point to plane, Chen and Medioni 1992; planes in
+//! cells as in `VoxelMap`, Yuan et al. 2022). The pose from odometry is the prior, with a
+//! covariance that grows with the distance traveled. A direction that the surfaces do not
+//! determine, such as that along a corridor, therefore follows odometry.
 
 mod cells;
 mod drift_tracker;
@@ -37,9 +37,9 @@ const MIN_INFORMATION: f64 = 5.0;
 /// The kind of sensor that measures the points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RangeSensor {
-    /// A scanner with centimeters of noise, which sees the walls of a room.
+    /// A scanner with centimeters of noise, which measures the walls of a room.
     Scanner,
-    /// A depth camera with millimeters of noise, which sees the things within reach of an arm.
+    /// A depth camera with millimeters of noise, which measures objects within reach of an arm.
     DepthCamera,
 }
 
@@ -120,7 +120,8 @@ struct Match {
 /// * `base`: position of the base in the same frame, meters.
 /// * `prior`: covariance of the motion that is still to be found, as in [`ScanMatch::covariance`].
 ///
-/// Returns `None` if too few points lie on known planes, or if the search does not converge.
+/// Returns `None` if too few points lie on known planes. After [`MAX_STEPS`], the result is used even
+/// if the last step was larger than [`CONVERGED`].
 fn match_scan(
     map: &SurfaceMap,
     points: &[Point3<f64>],

@@ -52,8 +52,8 @@ impl Corrections {
 /// Largest speeds of a base, m/s and rad/s. Poses that imply a higher speed have jumped.
 const MAX_SPEED_M_S: f64 = 5.0;
 const MAX_SPEED_RAD_S: f64 = 6.0;
-/// Changes that are not a jump at any speed, meters and radians. Matching finds errors of this size
-/// by itself.
+/// Changes that are not a jump at any speed, meters and radians. Scan matching corrects errors of
+/// this size.
 const MIN_JUMP_M: f64 = 0.1;
 const MIN_JUMP_RAD: f64 = 0.1;
 

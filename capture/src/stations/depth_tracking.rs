@@ -9,7 +9,7 @@ use nalgebra::{Matrix6, Point3};
 /// Number of points of each depth image. More points would lie on the same surfaces.
 const N_POINTS: u32 = 2500;
 /// Maximum standard deviations of a correction in any direction, meters and radians. With larger
-/// errors, an image would damage what the model has learned from earlier ones.
+/// errors, an image would blur the model.
 const MAX_SIGMA_M: f64 = 0.004;
 const MAX_SIGMA_RAD: f64 = 0.004;
 /// Maximum standard deviations of a correction that is more accurate than a share of the correction
@@ -28,8 +28,7 @@ pub(super) struct Tracked {
 /// The correction of the reported base poses according to depth images alone. It is known at once,
 /// but is less accurate than the registration of a station.
 ///
-/// It depends only on the keyframes and their order, and never on the registration, which ends at a
-/// time that depends on the computer.
+/// It does not use the results of registration, because their timing varies.
 pub(super) struct DepthTracking {
     tracker: DriftTracker,
     tracked_from_odom: Transform,

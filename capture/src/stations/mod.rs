@@ -298,15 +298,16 @@ impl Stations {
         });
         let mut released = Vec::new();
         self.process_queue(self.is_final_only, &mut released);
-        if !self.is_final_only {
-            self.pass_provisionally(&mut released);
-        }
+        self.pass_provisionally(&mut released);
         released
     }
 
     /// Passes changes that can pass before registration: keyframes whose depth determines the drift
     /// of the base, and keyframes of cameras that do not move with the base.
     fn pass_provisionally(&mut self, released: &mut Vec<Change>) {
+        if self.is_final_only {
+            return;
+        }
         let mut waiting: Vec<&mut Waiting> = self.held.iter_mut().chain(&mut self.queue).collect();
         for ix in 0..waiting.len() {
             if waiting[ix].stage != Stage::Queued {
@@ -360,9 +361,7 @@ impl Stations {
         if self.search.is_none() && self.is_overdue(settled_until) {
             self.start_search(&mut released);
         }
-        if !self.is_final_only {
-            self.pass_provisionally(&mut released);
-        }
+        self.pass_provisionally(&mut released);
         released
     }
 
