@@ -32,6 +32,28 @@ const MESA: [&str; 3] = [
 /// Flags for WebGL on the CPU with the browser's own renderer, which needs no library.
 const SWIFTSHADER: [&str; 2] = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
 
+/// Pages of the browser's own address bar, which a headless browser loads for each window. They take
+/// three times the computing time of opening an empty page.
+const NO_ADDRESS_BAR: &str =
+    "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup,WebUIOmniboxFullPopup";
+
+/// Time of a fixed piece of work, the shortest of several: numbers as text and back, sorting, and
+/// the layout of new elements.
+const REFERENCE_WORK: &str = "(() => {
+    const values = Array.from({ length: 4000 }, (_, ix) => Math.sin(ix));
+    const list = document.body.appendChild(document.createElement('div'));
+    let shortest = Infinity;
+    for (let run = 0; run < 20; run++) {
+        const began = performance.now();
+        const sorted = JSON.parse(JSON.stringify(values)).sort((a, b) => a - b);
+        const texts = sorted.slice(0, 400).map((value) => value.toFixed(3));
+        list.replaceChildren(...texts.map((text) => Object.assign(document.createElement('span'), { textContent: text })));
+        if (list.offsetHeight > 0) shortest = Math.min(shortest, performance.now() - began);
+    }
+    list.remove();
+    return shortest;
+})()";
+
 /// The hint at the first visit would cover a part of the view. This script makes the page believe
 /// that the browser has already shown the hint. Pages without an origin have no storage.
 const LATER_VISIT: &str = "try { localStorage.setItem('gestures-seen', '1'); } catch {}\n";
@@ -132,6 +154,7 @@ impl Process {
                 "--disable-component-update",
                 "--disable-extensions",
                 "--disable-sync",
+                NO_ADDRESS_BAR,
             ])
             .args(webgl)
             .env("LIBGL_ALWAYS_SOFTWARE", "1")
@@ -333,14 +356,25 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", event);
     }
 
+    /// Time in which the page does a fixed piece of work, milliseconds. It measures how fast this
+    /// computer runs pages.
+    pub fn reference_millis(&mut self) -> f64 {
+        let millis = self.evaluate(REFERENCE_WORK);
+        millis.as_f64().expect("the page can be laid out")
+    }
+
     /// The tasks of the page's main thread within this time.
     pub fn trace_tasks(&mut self, duration: Duration) -> Vec<Task> {
+        const MARK: &str = "thread of the page";
         let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
         self.call(
             "Tracing.start",
-            json!({"traceConfig": {"includedCategories": ["toplevel"]}}),
+            json!({"traceConfig": {"includedCategories": ["toplevel", "blink.user_timing"]}}),
         );
+        self.session = session;
+        self.evaluate(&format!("performance.mark('{MARK}') && 0"));
         std::thread::sleep(duration);
+        let session = std::mem::take(&mut self.session);
         self.call("Tracing.end", json!({}));
         let mut events: Vec<Value> = Vec::new();
         loop {
@@ -357,17 +391,12 @@ impl Browser {
             }
         }
         self.session = session;
-        let is_main = |event: &&Value| {
-            event["name"] == "thread_name" && event["args"]["name"] == "CrRendererMain"
-        };
-        let main_threads: Vec<_> = events
-            .iter()
-            .filter(is_main)
-            .map(|event| (&event["pid"], &event["tid"]))
-            .collect();
+        // Other pages, such as those of the browser itself, have threads of the same name.
+        let thread = |event: &Value| [event["pid"].clone(), event["tid"].clone()];
+        let mark = events.iter().find(|event| event["name"] == MARK);
+        let main_thread = thread(mark.expect("the page has set a mark"));
         let is_task = |event: &&Value| {
-            event["name"] == "ThreadControllerImpl::RunTask"
-                && main_threads.contains(&(&event["pid"], &event["tid"]))
+            event["name"] == "ThreadControllerImpl::RunTask" && thread(event) == main_thread
         };
         let task = |event: &Value| {
             Some(Task {

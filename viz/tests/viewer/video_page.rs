@@ -39,9 +39,14 @@ const PLAY: &str = "(async () => {
     video.muted = true;
     video.src = window.createUrl(window.file);
     await event('loadeddata');
-    const seeked = event('seeked');
+    // The event of a seek may come before the frame can be drawn.
+    const shown = new Promise((done) => {
+        const check = (_, { mediaTime }) =>
+            Math.abs(mediaTime - FRAME / 30) < 0.5 / 30 ? done() : video.requestVideoFrameCallback(check);
+        video.requestVideoFrameCallback(check);
+    });
     video.currentTime = (FRAME + 0.5) / 30;
-    await seeked;
+    await shown;
     const canvas = new OffscreenCanvas(video.videoWidth, video.videoHeight);
     const context = canvas.getContext('2d');
     context.drawImage(video, 0, 0);

@@ -20,6 +20,10 @@ export class Banner {
 
   constructor() {
     phones.addEventListener("change", () => this.show());
+    const header = document.querySelector("header")!;
+    new ResizeObserver(() => {
+      element("banner").style.setProperty("--header-height", `${header.offsetHeight}px`);
+    }).observe(header);
   }
 
   /** Sets the reason why the scene cannot be drawn; empty if it can. */
@@ -65,7 +69,6 @@ export class Banner {
         : (guidance?.text ?? this.graphics);
     const banner = element("banner");
     setText(banner, text);
-    banner.style.setProperty("--header-height", `${document.querySelector("header")?.offsetHeight ?? 0}px`);
     banner.dataset.kind = hasProblem ? this.connection : text === "" ? "open" : this.kindOfNotice(isUnexplained);
     element("view").classList.toggle("stale", hasProblem);
   }

@@ -13,9 +13,16 @@ export class Chart {
   private points: Curve = [];
   private others: Curve[] = [];
   private hovered: number | null = null;
+  /** Size in CSS pixels. Reading it from the canvas would lay the page out. */
+  private sizePx = { width: 0, height: 0 };
+  private shown = "";
 
   constructor(private readonly canvas: HTMLCanvasElement) {
-    new ResizeObserver(() => this.draw()).observe(canvas);
+    new ResizeObserver((entries) => {
+      const { width, height } = entries[entries.length - 1]!.contentRect;
+      this.sizePx = { width, height };
+      this.draw();
+    }).observe(canvas);
     canvas.addEventListener("pointermove", (event) => {
       this.hovered = event.offsetX;
       this.draw();
@@ -27,6 +34,9 @@ export class Chart {
   }
 
   set(points: Curve, others: Curve[]): void {
+    const shown = JSON.stringify([points, others]);
+    if (shown === this.shown) return;
+    this.shown = shown;
     this.points = finite(points);
     this.others = others.map(finite).filter((curve) => curve.length > 0);
     this.draw();
@@ -34,8 +44,7 @@ export class Chart {
 
   private draw(): void {
     const { canvas } = this;
-    const width = canvas.clientWidth;
-    const height = canvas.clientHeight;
+    const { width, height } = this.sizePx;
     const context = canvas.getContext("2d");
     if (!context || width === 0) return;
     canvas.width = Math.round(width * devicePixelRatio);
@@ -108,7 +117,7 @@ export class Chart {
     if (this.hovered === null) return;
     const text = `${psnr.toFixed(2)} dB at ${timeText(seconds)}`;
     const half = context.measureText(text).width / 2;
-    const middle = Math.min(Math.max(px, MARGIN.left + half), this.canvas.clientWidth - MARGIN.right - half);
+    const middle = Math.min(Math.max(px, MARGIN.left + half), this.sizePx.width - MARGIN.right - half);
     const above = py > 30 ? py - 12 : py + 20;
     context.fillStyle = color("--raised");
     context.fillRect(middle - half - 4, above - 11, 2 * half + 8, 15);

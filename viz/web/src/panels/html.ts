@@ -27,3 +27,13 @@ export function descriptions(rows: readonly [string, string][]): HTMLElement {
 export function setText(target: Element, text: string): void {
   if (target.textContent !== text) target.textContent = text;
 }
+
+const shownItems = new WeakMap<Element, string>();
+
+/** Shows a list. The elements of an unchanged list are kept, because new ones would have to be laid out again. */
+export function setList<T>(target: Element, items: readonly T[], elements: (item: T) => readonly HTMLElement[]): void {
+  const key = JSON.stringify(items);
+  if (shownItems.get(target) === key) return;
+  shownItems.set(target, key);
+  target.replaceChildren(...items.flatMap(elements));
+}

@@ -2,7 +2,7 @@
 
 import { Chart } from "./chart";
 import { element } from "./element";
-import { child, setText } from "./html";
+import { child, setList, setText } from "./html";
 import { storeText } from "./header";
 import { bytesText, countText, stepTimeText, timeText } from "./quantities";
 import type { ModelStatus, Status } from "../connection/protocol";
@@ -42,9 +42,10 @@ function showKeyframes({ state, keyframes, rejected, images, store }: Status): v
   row("evicted", images && images.evicted > 0 ? countText(images.evicted) : null);
   row("dropped-total", images ? countText(images.dropped) : null);
   row("rejected-total", isSaved ? null : countText(nRejected));
-  element("rejected").replaceChildren(
-    ...reasons.flatMap(([reason, n]) => [child("dt", reason.replaceAll("_", " ")), child("dd", countText(n))]),
-  );
+  setList(element("rejected"), reasons, ([reason, n]) => [
+    child("dt", reason.replaceAll("_", " ")),
+    child("dd", countText(n)),
+  ]);
 }
 
 /** Shows a value, or hides it with its label if it is null. */
@@ -60,13 +61,12 @@ function showNotes({ notes, infos, checkpoint }: Status): void {
   const shown = notes.filter((note) => note !== checkpoint?.text);
   const sorted = [...shown.filter((note) => !isInfo(note)), ...shown.filter(isInfo)];
   element("notes-card").hidden = sorted.length === 0;
-  element("notes").replaceChildren(
-    ...sorted.map((note) => {
-      const item = child("li", note);
-      item.dataset.kind = isInfo(note) ? "info" : "warning";
-      return item;
-    }),
-  );
+  const items = sorted.map((note) => [note, isInfo(note) ? "info" : "warning"] as const);
+  setList(element("notes"), items, ([note, kind]) => {
+    const item = child("li", note);
+    item.dataset.kind = kind;
+    return [item];
+  });
 }
 
 function text(id: string, value: string): void {

@@ -90,6 +90,8 @@ export class OrbitView {
   /** Whether the overview cuts away surfaces that hide the robot. False after the user has shown the whole model again. */
   private mayCutForRobot = true;
   private isStale = true;
+  /** Size in CSS pixels. Reading it from the canvas would lay the page out. */
+  private sizePx: [number, number] = [0, 0];
   private isModelShown = true;
   /** Whether another direction than the server's points up. */
   private isTurned = false;
@@ -520,7 +522,7 @@ export class OrbitView {
     this.measure.update();
     for (const tool of this.tools) tool.update();
     this.robot.fadeNear(this.camera.position);
-    this.arrow = arrowPlace(this.sceneViews.robotBox(), this.camera, [this.canvas.clientWidth, this.canvas.clientHeight]);
+    this.arrow = arrowPlace(this.sceneViews.robotBox(), this.camera, this.sizePx);
     if (this.frames.isVisible) this.updateFrames();
     this.renderer.clear();
     this.renderer.render(this.background, this.camera);
@@ -611,6 +613,7 @@ export class OrbitView {
   private fit(): void {
     if (this.headView) return; // The renderer has the size of the headset.
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
+    this.sizePx = [clientWidth, clientHeight];
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(1, clientHeight);
     this.camera.updateProjectionMatrix();
