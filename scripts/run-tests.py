@@ -62,6 +62,9 @@ NOT_QUICK = {
     "session unit": ("session::tests", "recoveries::tests"),
 }
 N_SLOWEST = 10
+# Number of the longest programs in the last line, and maximum length of a message of a failed test.
+N_LONGEST = 5
+MAX_MESSAGE = 300
 
 TEST_LINE = re.compile(r"test (.+?)(?: - should panic| - compile| - compile fail)? \.\.\. (ok|FAILED|ignored)\b(?:.*<([0-9.]+)s>)?")
 
@@ -160,6 +163,11 @@ def tests_in(output):
     """Name, result and seconds of each test in the output of a program."""
     found = filter(None, map(TEST_LINE.match, output.splitlines()))
     return [(line[1], line[2], float(line[3] or 0)) for line in found]
+
+
+def panics_in(output, test):
+    """Place and first line of the message of each panic in the thread of a test."""
+    return re.findall(rf"^thread '{re.escape(test)}'.* panicked at (.+):\n(.*)$", output, re.MULTILINE)
 
 
 def build(cargo_arguments):
@@ -309,7 +317,10 @@ def summarize(programs):
         print("\nfailed:")
     for program in failed:
         names = [test for test, result, _ in program.tests if result == "FAILED"]
-        print(f"    {program.name}: {', '.join(names) or f'exit status {program.status}'}")
+        for name in names or [f"exit status {program.status}"]:
+            print(f"    {program.name}: {name}")
+            for place, message in panics_in(program.output, name):
+                print(f"        {place}: {message[:MAX_MESSAGE]}")
     n_passed, n_failed, n_skipped = (sum(counts) for counts in zip(*(program.counts() for program in programs)))
     n_failed += sum(program.count("FAILED") == 0 for program in failed)
     print(f"\n{n_passed} passed, {n_failed} failed, {n_skipped} skipped")
@@ -346,11 +357,15 @@ def main():
         for program in programs:
             program.stop()
         sys.exit(130)
-    text = report(read_steps(arguments.steps), build_secs, time.monotonic() - since, programs)
+    test_secs = time.monotonic() - since
+    text = report(read_steps(arguments.steps), build_secs, test_secs, programs)
     print(f"\n{text}")
     if arguments.report:
         arguments.report.write_text(text + "\n")
-    sys.exit(0 if summarize(programs) else 1)
+    has_passed = summarize(programs)
+    longest = sorted(programs, key=lambda program: -program.secs)[:N_LONGEST]
+    print(f"build {build_secs:.0f} s, tests {test_secs:.0f} s; {', '.join(f'{of.name} {of.secs:.0f} s' for of in longest)}")
+    sys.exit(0 if has_passed else 1)
 
 
 if __name__ == "__main__":

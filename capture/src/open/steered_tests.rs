@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use toml::Value;
 
 /// Maximum time until a state, on a machine that is busy with other tests.
-const TIMEOUT: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(600);
 /// How far the first joint is moved, radians.
 const TURN_RAD: f64 = 0.15;
 /// Largest difference between a setpoint and the arm at rest, radians. The scene's own arm has the
