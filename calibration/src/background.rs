@@ -7,6 +7,7 @@ use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
 use background::{Task, run_in_background_pool};
 use keyframe::Keyframe;
 use kinematics::Stamp;
+use std::collections::HashSet;
 use std::sync::Arc;
 
 /// Step at which training waits for the result and applies it.
@@ -265,6 +266,8 @@ pub struct MovementTask {
     worker: Worker,
     /// Keyframes to test, in order of arrival.
     pending: Vec<Arc<Keyframe>>,
+    /// Stamps of all keyframes so far, by camera.
+    known: HashSet<(Arc<str>, Stamp)>,
 }
 
 /// Where the detector is.
@@ -295,12 +298,26 @@ impl MovementTask {
         Self {
             worker: Worker::New(references),
             pending: Vec::new(),
+            known: HashSet::new(),
         }
     }
 
-    /// Adds a keyframe to test.
+    /// Adds a keyframe to test. A revised keyframe replaces the one before if that was not tested
+    /// yet, and is not tested again otherwise, because an image must not count twice.
     pub fn push(&mut self, keyframe: Arc<Keyframe>) {
-        self.pending.push(keyframe);
+        if self
+            .known
+            .insert((Arc::clone(&keyframe.camera), keyframe.stamp))
+        {
+            self.pending.push(keyframe);
+            return;
+        }
+        let mut pending = self.pending.iter_mut();
+        if let Some(before) =
+            pending.find(|of| of.camera == keyframe.camera && of.stamp == keyframe.stamp)
+        {
+            *before = keyframe;
+        }
     }
 
     /// Starts testing the pending keyframes on a background thread, unless one is already running.
@@ -343,5 +360,36 @@ impl MovementTask {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scenes::{Miscalibration, capture};
+    use kinematics::Transform;
+
+    #[test]
+    fn a_revised_keyframe_is_tested_once() {
+        let keyframes = capture(&Miscalibration::none());
+        let [references, later] = [&keyframes[..2], &keyframes[2..5]];
+        let mut task = MovementTask::new(references.to_vec());
+        later.iter().for_each(|of| task.push(Arc::clone(of)));
+        let revision = Transform::translation(0.002, 0.0, 0.0);
+        let revised = |of: &Keyframe| {
+            Arc::new(Keyframe {
+                world_from_camera: revision * of.world_from_camera,
+                ..of.clone()
+            })
+        };
+        task.push(revised(&later[1]));
+        assert_eq!(task.pending.len(), 3);
+        assert_eq!(
+            task.pending[1].world_from_camera,
+            revision * later[1].world_from_camera
+        );
+        assert!(task.poll(true).expect("no panic").is_none());
+        task.push(revised(&later[2]));
+        assert!(task.pending.is_empty(), "it was tested before");
     }
 }

@@ -150,6 +150,8 @@ pub enum CheckpointProgress {
 /// A writer thread.
 struct WriterThread {
     thread: Task<anyhow::Result<()>>,
+    /// Keyframes that it stores again.
+    revised: Vec<Arc<Keyframe>>,
     /// `true` if it writes a checkpoint, `false` if it writes only keyframes.
     is_checkpoint: bool,
 }
@@ -238,9 +240,11 @@ impl Checkpoints {
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
             let revised = std::mem::take(&mut self.revised);
-            let thread = Task::start("keyframes", move || stored.add(&keyframes, &revised));
+            let written = revised.clone();
+            let thread = Task::start("keyframes", move || stored.add(&keyframes, &written));
             self.writer = Some(WriterThread {
                 thread,
+                revised,
                 is_checkpoint: false,
             });
             self.last_keyframes = Instant::now();
@@ -313,9 +317,11 @@ impl Checkpoints {
 
     /// Writes a copy on a separate thread.
     pub fn write(&mut self, job: CheckpointWrite) {
+        let revised = job.revised.clone();
         let thread = Task::start("checkpoint", move || job.write());
         self.writer = Some(WriterThread {
             thread,
+            revised,
             is_checkpoint: true,
         });
         if self.requested == Some(CheckpointProgress::Due) {
@@ -370,6 +376,7 @@ impl Checkpoints {
     pub fn wait(&mut self) -> anyhow::Result<()> {
         let Some(WriterThread {
             thread,
+            revised,
             is_checkpoint,
         }) = self.writer.take()
         else {
@@ -377,6 +384,9 @@ impl Checkpoints {
         };
         match thread.join() {
             Ok(written) => {
+                if written.is_err() {
+                    self.revised.extend(revised);
+                }
                 if is_checkpoint && self.requested == Some(CheckpointProgress::Writing) {
                     self.requested = Some(match &written {
                         Ok(()) => CheckpointProgress::Written,
@@ -460,6 +470,31 @@ mod tests {
         assert_eq!(none.or_previous(&flags(two)).period, two.period);
         assert_eq!(one.or_previous(&flags(two)).period, one.period);
         assert_eq!(none.or_previous(&flags(none)).period, None);
+    }
+
+    #[test]
+    fn revised_keyframes_that_could_not_be_stored_are_stored_later() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let checkpoints = Checkpoints::new(folder.path(), CheckpointOptions::default());
+        let mut checkpoints = checkpoints
+            .expect("checkpoints are written")
+            .with_keyframes(folder.path());
+        let keyframe = crate::stored_keyframes::tests::keyframe(3, false);
+        let mut write = |fails: bool| {
+            checkpoints.store_again(&keyframe);
+            let revised = std::mem::take(&mut checkpoints.revised);
+            checkpoints.writer = Some(WriterThread {
+                thread: Task::start("keyframes", move || {
+                    anyhow::ensure!(!fails, "the disk is full");
+                    Ok(())
+                }),
+                revised,
+                is_checkpoint: false,
+            });
+            assert_eq!(checkpoints.wait().is_err(), fails);
+            std::mem::take(&mut checkpoints.revised).len()
+        };
+        assert_eq!([true, false].map(&mut write), [1, 0]);
     }
 
     #[test]

@@ -362,12 +362,12 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use keyframe::Split;
     use kinematics::Transform;
 
-    fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
+    pub(crate) fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
         let pose = Transform::new(
             Vector3::new(0.1, 1.0 / 3.0, -2.0),
             Vector3::new(0.3, -0.2, 0.1),

@@ -131,25 +131,36 @@ pub(crate) fn match_keyframes(
 ) -> Result<MatchedAndOthers, Error> {
     // A model is not trained on test keyframes. With another split, a training keyframe may have
     // become a test keyframe. Without this filter, the model would be trained on it.
-    let by_name: HashMap<_, _> = keyframes
+    let mut by_name: HashMap<_, Vec<&Arc<Keyframe>>> = HashMap::new();
+    for keyframe in keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
-        .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
-        .collect();
+    {
+        let name = (&*keyframe.camera, keyframe.stamp.0);
+        by_name.entry(name).or_default().push(keyframe);
+    }
     let mut found: Vec<(Arc<Keyframe>, &Arc<Keyframe>)> = Vec::new();
     let mut missing: Vec<Arc<Keyframe>> = Vec::new();
     for expected in expected {
-        let Some(keyframe) = by_name.get(&(expected.camera.as_str(), expected.stamp_nanos)) else {
+        let name = (expected.camera.as_str(), expected.stamp_nanos);
+        let candidates = by_name.get(&name).map_or(&[][..], Vec::as_slice);
+        let Some(last) = candidates.last() else {
             missing.push(Arc::new(expected.placeholder()));
             continue;
         };
-        let Some(difference) = expected.difference(keyframe) else {
-            found.push((Arc::clone(keyframe), *keyframe));
+        // A keyframe that was revised is there with several poses.
+        let same = candidates
+            .iter()
+            .find(|keyframe| expected.difference(keyframe).is_none());
+        if let Some(same) = same {
+            found.push((Arc::clone(same), *same));
             continue;
-        };
-        match expected.with_recorded_base(keyframe) {
-            Some(recorded) => found.push((Arc::new(recorded), *keyframe)),
-            None => return Err(Error::CheckpointData(difference)),
+        }
+        match (expected.with_recorded_base(last), expected.difference(last)) {
+            (Some(recorded), _) => found.push((Arc::new(recorded), *last)),
+            (None, difference) => {
+                return Err(Error::CheckpointData(difference.unwrap_or_default()));
+            }
         }
     }
     // All missing keyframes are listed, so that the caller can continue without them in one
@@ -219,6 +230,13 @@ mod tests {
             KeyframeSignature::of(&found[0]).world_from_camera,
             expected[0].world_from_camera
         );
+        // If both versions are there, in any order, the recorded one is found.
+        let recorded = Arc::new(recorded);
+        for both in [[&recorded, &revised], [&revised, &recorded]] {
+            let both = both.map(Arc::clone);
+            let (found, others) = match_keyframes(&expected, &both).expect("a match");
+            assert!(Arc::ptr_eq(&found[0], &recorded) && Arc::ptr_eq(&others[0], &revised));
+        }
         // Any other difference remains an error.
         let moved = Arc::new(Keyframe {
             world_from_camera: revision * revised.world_from_camera,

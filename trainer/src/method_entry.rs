@@ -38,6 +38,9 @@ pub struct MethodEntry {
     pub single_file: Option<SingleFile>,
     /// Whether the method trains only on keyframes with depth.
     pub needs_depth: bool,
+    /// Whether a keyframe that the model was trained on can be replaced by the same keyframe with a
+    /// more accurate pose.
+    pub can_revise: bool,
     /// Whether models can be sent to clients that draw them themselves, see
     /// [`Method::queue_chunks`].
     pub has_chunks: bool,

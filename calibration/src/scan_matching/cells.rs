@@ -24,6 +24,10 @@ pub(super) struct Cell {
     plane: Option<Plane>,
     /// Number of points from which `plane` was computed.
     n_in_plane: u32,
+    /// Segment of the path from which the cell was first seen.
+    segment: usize,
+    /// Index of the last scan with a point in the cell.
+    seen_at: u64,
 }
 
 /// A plane that was fitted to the points of a cell.
@@ -62,8 +66,28 @@ impl Plane {
 }
 
 impl Cell {
-    /// Adds a point, unless the cell is full. `offset`: from the center of the cell, meters.
-    pub(super) fn add(&mut self, offset: &Vector3<f64>) {
+    /// An empty cell that is first seen from this segment of the path.
+    pub(super) fn new(segment: usize) -> Self {
+        Self {
+            segment,
+            ..Self::default()
+        }
+    }
+
+    /// Segment of the path from which the cell was first seen.
+    pub(super) fn segment(&self) -> usize {
+        self.segment
+    }
+
+    /// Index of the last scan with a point in the cell.
+    pub(super) fn seen_at(&self) -> u64 {
+        self.seen_at
+    }
+
+    /// Adds a point of a scan, unless the cell is full. `offset`: from the center of the cell,
+    /// meters.
+    pub(super) fn add(&mut self, offset: &Vector3<f64>, scan_ix: u64) {
+        self.seen_at = scan_ix;
         if self.n_points < MAX_POINTS {
             self.n_points += 1;
             self.sum += offset;

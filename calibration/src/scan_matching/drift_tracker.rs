@@ -3,6 +3,7 @@
 use super::{RangeSensor, ScanMatch, SurfaceMap, match_scan};
 use kinematics::Transform;
 use nalgebra::{Matrix6, Point3, Vector6};
+use std::collections::BTreeMap;
 
 /// Assumed drift of odometry after one meter, meters and radians. The drift is a random walk, so it
 /// grows with the root of the distance. Legged robots and wheels on smooth floors drift less.
@@ -18,13 +19,29 @@ const REST_DRIFT_RAD: f64 = 1e-5;
 
 /// Estimates the drift of odometry with range scans. It matches each scan with the surfaces of all
 /// earlier ones.
+///
+/// The path has several segments if a scan cannot be matched, for example because the base has
+/// passed through a place without surfaces. A new segment begins there. Later scans are located
+/// relative to the surfaces of this segment, which are as uncertain as the pose at its begin.
 #[derive(Debug)]
 pub struct DriftTracker {
     map: SurfaceMap,
-    /// Covariance of the current correction.
-    covariance: Matrix6<f64>,
+    segments: Vec<Segment>,
+    /// Covariance of the current correction relative to the matched surfaces.
+    relative: Matrix6<f64>,
+    /// Covariance of these surfaces.
+    of_surfaces: Matrix6<f64>,
     /// Pose of the base at the last scan.
     last: Option<Transform>,
+}
+
+/// A part of the path in which each scan was matched with earlier ones.
+#[derive(Debug)]
+struct Segment {
+    /// Pose of the base at its first scan.
+    world_from_base: Transform,
+    /// Covariance of the correction there.
+    covariance: Matrix6<f64>,
 }
 
 impl DriftTracker {
@@ -33,7 +50,9 @@ impl DriftTracker {
     pub fn new(sensor: RangeSensor) -> Self {
         Self {
             map: SurfaceMap::new(sensor),
-            covariance: Matrix6::zeros(),
+            segments: Vec::new(),
+            relative: Matrix6::zeros(),
+            of_surfaces: Matrix6::zeros(),
             last: None,
         }
     }
@@ -41,8 +60,17 @@ impl DriftTracker {
     /// Covariance of the correction at the last scan, as in [`ScanMatch::covariance`]. Before the
     /// first one, it is zero.
     #[must_use]
-    pub fn covariance(&self) -> &Matrix6<f64> {
-        &self.covariance
+    pub fn covariance(&self) -> Matrix6<f64> {
+        self.relative + self.of_surfaces
+    }
+
+    /// Covariance of the correction at a pose of the base for which there is no match.
+    #[must_use]
+    pub fn covariance_at(&self, world_from_base: &Transform) -> Matrix6<f64> {
+        let Some(last) = self.last else {
+            return self.covariance();
+        };
+        self.prior(world_from_base) + carried(&self.of_surfaces, &last, world_from_base)
     }
 
     /// Adds a scan, and returns how it was matched. `None` if it was added without a comparison,
@@ -56,29 +84,70 @@ impl DriftTracker {
         world_from_base: &Transform,
     ) -> Option<ScanMatch> {
         let prior = self.prior(world_from_base);
-        let Some(found) = self.match_with(points, world_from_base, &prior) else {
-            self.map.add(points);
-            self.covariance = prior;
+        let Some((found, n_by_segment)) = self.match_with(points, world_from_base, &prior) else {
+            let covariance = self.covariance_at(world_from_base);
+            self.map.add(points, self.segments.len());
+            self.segments.push(Segment {
+                world_from_base: *world_from_base,
+                covariance,
+            });
+            self.relative = prior;
+            self.of_surfaces = covariance - prior;
             self.last = Some(*world_from_base);
             return None;
         };
         let moved: Vec<Point3<f64>> = points.iter().map(|point| found.motion * point).collect();
-        self.map.add(&moved);
-        self.covariance = found.covariance;
-        self.last = Some(found.motion * world_from_base);
-        Some(found)
+        let here = found.motion * world_from_base;
+        // Surfaces that are seen for the first time are placed relative to known ones of a segment.
+        let (segment, _) = n_by_segment
+            .iter()
+            .max_by_key(|(_, n)| **n)
+            .expect("a match has points");
+        self.map.add(&moved, *segment);
+        self.relative = found.covariance;
+        self.of_surfaces = self.of_surfaces(&n_by_segment, &here);
+        self.last = Some(here);
+        Some(ScanMatch {
+            covariance: self.covariance(),
+            ..found
+        })
     }
 
     /// Matches a scan without adding it. See [`Self::add`].
     #[must_use]
     pub fn locate(&self, points: &[Point3<f64>], world_from_base: &Transform) -> Option<ScanMatch> {
-        self.match_with(points, world_from_base, &self.prior(world_from_base))
+        let prior = self.prior(world_from_base);
+        let (found, n_by_segment) = self.match_with(points, world_from_base, &prior)?;
+        let here = found.motion * world_from_base;
+        Some(ScanMatch {
+            covariance: found.covariance + self.of_surfaces(&n_by_segment, &here),
+            ..found
+        })
     }
 
-    /// Covariance of the correction at a pose of the base, before a match.
+    /// Covariance of matched surfaces, seen from a pose of the base. All surfaces of a segment have
+    /// the same error. Those of several segments are assumed to have related errors.
+    fn of_surfaces(
+        &self,
+        n_by_segment: &BTreeMap<usize, usize>,
+        world_from_base: &Transform,
+    ) -> Matrix6<f64> {
+        let n_all: usize = n_by_segment.values().sum();
+        let weighted = n_by_segment.iter().map(|(ix, n)| {
+            let Segment {
+                world_from_base: from,
+                covariance,
+            } = &self.segments[*ix];
+            carried(covariance, from, world_from_base) * (*n as f64 / n_all as f64)
+        });
+        weighted.sum()
+    }
+
+    /// Covariance of the correction relative to the surfaces matched last, at a pose of the base
+    /// and before a match.
     fn prior(&self, world_from_base: &Transform) -> Matrix6<f64> {
-        self.last.map_or(self.covariance, |last| {
-            carried(&self.covariance, &last, world_from_base)
+        self.last.map_or(self.relative, |last| {
+            carried(&self.relative, &last, world_from_base)
                 + drift_covariance(&last, world_from_base)
         })
     }
@@ -88,7 +157,7 @@ impl DriftTracker {
         points: &[Point3<f64>],
         world_from_base: &Transform,
         prior: &Matrix6<f64>,
-    ) -> Option<ScanMatch> {
+    ) -> Option<(ScanMatch, BTreeMap<usize, usize>)> {
         let base = Point3::from(world_from_base.translation.vector);
         (!self.map.is_empty())
             .then(|| match_scan(&self.map, points, &base, prior))

@@ -18,7 +18,8 @@ use crate::rigid_transform;
 use kinematics::Transform;
 use nalgebra::{Cholesky, Matrix3, Matrix6, Point3, SymmetricEigen, Vector3, Vector6};
 use rustc_hash::FxHashMap;
-use surface_map::{CellId, SurfaceMap};
+use std::collections::BTreeMap;
+use surface_map::{CellId, NearPlane, SurfaceMap};
 
 /// Maximum number of points of a scan that are compared. More points would not be independent,
 /// because they lie on the same planes.
@@ -30,6 +31,9 @@ const MIN_PLANES: usize = 6;
 const MAX_STEPS: usize = 20;
 /// Steps that are smaller than this end the search, meters and radians.
 const CONVERGED: f64 = 2e-5;
+/// Maximum size of the last of [`MAX_STEPS`] steps, relative to the error of a plane. Points at the
+/// limit of the distance may be matched in every second step, so some searches do not converge.
+const MAX_LAST_STEP: f64 = 0.5;
 /// Minimum information about a direction of translation, relative to the information that errors of
 /// normals give.
 const MIN_INFORMATION: f64 = 5.0;
@@ -104,6 +108,8 @@ pub struct ScanMatch {
 /// A point of the scan on a plane of the map.
 struct Match {
     cell: CellId,
+    /// Segment of the path from which the plane was first seen.
+    segment: usize,
     normal: Vector3<f64>,
     arm: Vector3<f64>,
     distance_m: f64,
@@ -120,14 +126,14 @@ struct Match {
 /// * `base`: position of the base in the same frame, meters.
 /// * `prior`: covariance of the motion that is still to be found, as in [`ScanMatch::covariance`].
 ///
-/// Returns `None` if too few points lie on known planes. After [`MAX_STEPS`], the result is used even
-/// if the last step was larger than [`CONVERGED`].
+/// Returns `None` if too few points lie on known planes, or if the search does not converge. Also
+/// returns how many points were matched with the planes of each segment of the path.
 fn match_scan(
     map: &SurfaceMap,
     points: &[Point3<f64>],
     base: &Point3<f64>,
     prior: &Matrix6<f64>,
-) -> Option<ScanMatch> {
+) -> Option<(ScanMatch, BTreeMap<usize, usize>)> {
     let stride = points.len().div_ceil(MAX_POINTS).max(1);
     let points: Vec<Point3<f64>> = points.iter().step_by(stride).copied().collect();
     let prior_information = Cholesky::new(*prior)?.inverse();
@@ -155,15 +161,24 @@ fn match_scan(
         let cholesky = Cholesky::new(information)?;
         let change = -cholesky.solve(&gradient);
         motion = from_parameters(&change, base) * motion;
-        let is_narrow = narrowed >= 1.0;
-        if is_narrow && change.amax() < CONVERGED || step + 1 == MAX_STEPS {
+        let max_change = if step + 1 < MAX_STEPS {
+            CONVERGED
+        } else {
+            MAX_LAST_STEP * map.sensor().plane_error_m()
+        };
+        if narrowed >= 1.0 && change.amax() < max_change {
             let squares: f64 = matches.iter().map(|of| of.distance_m * of.distance_m).sum();
-            return Some(ScanMatch {
+            let mut n_by_segment = BTreeMap::new();
+            for of in &matches {
+                *n_by_segment.entry(of.segment).or_default() += 1;
+            }
+            let found = ScanMatch {
                 motion,
                 covariance: cholesky.inverse(),
                 n_matched: matches.len(),
                 rms_m: (squares / matches.len() as f64).sqrt(),
-            });
+            };
+            return Some((found, n_by_segment));
         }
     }
     None
@@ -180,11 +195,16 @@ fn find_matches(
         [map.sensor().point_noise_m(), map.sensor().plane_error_m()];
     let moved = points.iter().map(|point| motion * point);
     let matches = moved.filter_map(|point| {
-        let (cell, plane) = map.plane_at(&point)?;
+        let NearPlane {
+            cell,
+            plane,
+            segment,
+        } = map.plane_at(&point)?;
         let distance_m = plane.distance_m(&point);
         let noise = plane.variance + point_noise_m * point_noise_m;
         (distance_m.abs() <= max_distance_m).then(|| Match {
             cell,
+            segment,
             normal: plane.normal,
             arm: point - base,
             distance_m,

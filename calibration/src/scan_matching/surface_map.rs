@@ -11,12 +11,16 @@ use rustc_hash::FxHashMap;
 const N_GRIDS: usize = 2;
 /// Maximum distance of a plane from the center of its cell, relative to the side of the cell.
 const MAX_OFFSET: f64 = 0.3;
+/// Maximum number of cells of a grid, which bounds the memory to about 0.5 GB. A grid that exceeds
+/// it forgets the half of its cells that was not seen for the longest time.
+const MAX_CELLS: usize = 200_000;
 
 /// Surfaces that were seen so far: planes in the cells of several grids.
 #[derive(Debug)]
 pub(super) struct SurfaceMap {
     sensor: RangeSensor,
     grids: Vec<Grid>,
+    n_scans: u64,
 }
 
 #[derive(Debug)]
@@ -43,6 +47,7 @@ impl SurfaceMap {
             .flat_map(|side_m| (0..N_GRIDS).map(move |shift| (side_m, shift)));
         Self {
             sensor,
+            n_scans: 0,
             grids: grids
                 .map(|(side_m, shift)| Grid {
                     side_m,
@@ -73,12 +78,33 @@ impl Grid {
     }
 
     /// The plane of the cell that contains a point, and its offset from the center of the cell.
-    fn plane_at(&self, point: &Point3<f64>) -> Option<([i32; 3], &Plane, f64)> {
+    fn plane_at(&self, point: &Point3<f64>) -> Option<([i32; 3], &Cell, &Plane, f64)> {
         let key = self.key(point);
-        let plane = self.cells.get(&key)?.plane()?;
+        let cell = self.cells.get(&key)?;
+        let plane = cell.plane()?;
         let offset = plane.distance_m(&self.center(key)).abs() / self.side_m;
-        (offset <= MAX_OFFSET).then_some((key, plane, offset))
+        (offset <= MAX_OFFSET).then_some((key, cell, plane, offset))
     }
+
+    /// Forgets the cells that were not seen for the longest time, if there are more than this
+    /// number.
+    fn forget_oldest(&mut self, max_cells: usize) {
+        if self.cells.len() <= max_cells {
+            return;
+        }
+        let mut seen_at: Vec<u64> = self.cells.values().map(Cell::seen_at).collect();
+        let middle = seen_at.len() / 2;
+        let median = *seen_at.select_nth_unstable(middle).1;
+        self.cells.retain(|_, cell| cell.seen_at() > median);
+    }
+}
+
+/// A plane of the map near a point.
+pub(super) struct NearPlane {
+    pub(super) cell: CellId,
+    pub(super) plane: Plane,
+    /// Segment of the path from which the plane was first seen.
+    pub(super) segment: usize,
 }
 
 impl SurfaceMap {
@@ -87,14 +113,19 @@ impl SurfaceMap {
         self.grids.iter().all(|grid| grid.cells.is_empty())
     }
 
-    /// Adds points in the world frame, meters.
-    pub(super) fn add(&mut self, points: &[Point3<f64>]) {
+    /// Adds the points of a scan in the world frame, meters.
+    ///
+    /// * `segment`: the part of the path on which the scan was made.
+    pub(super) fn add(&mut self, points: &[Point3<f64>], segment: usize) {
+        let scan_ix = self.n_scans;
+        self.n_scans += 1;
         for grid in &mut self.grids {
             let mut changed = Vec::new();
             for point in points {
                 let key = grid.key(point);
                 let center = grid.center(key);
-                grid.cells.entry(key).or_default().add(&(point - center));
+                let cell = grid.cells.entry(key).or_insert_with(|| Cell::new(segment));
+                cell.add(&(point - center), scan_ix);
                 changed.push(key);
             }
             changed.sort_unstable();
@@ -105,20 +136,56 @@ impl SurfaceMap {
                     cell.refresh(&center, self.sensor.noise_m());
                 }
             }
+            grid.forget_oldest(MAX_CELLS);
         }
     }
 
     /// The plane near a point, from the largest cells that have one.
-    pub(super) fn plane_at(&self, point: &Point3<f64>) -> Option<(CellId, Plane)> {
+    pub(super) fn plane_at(&self, point: &Point3<f64>) -> Option<NearPlane> {
         let mut grids = self.grids.chunks(N_GRIDS).enumerate();
         grids.find_map(|(level, grids)| {
             let found = grids.iter().enumerate().filter_map(|(ix, grid)| {
-                let (key, plane, offset) = grid.plane_at(point)?;
+                let (key, cell, plane, offset) = grid.plane_at(point)?;
                 let grid = level * N_GRIDS + ix;
-                Some((CellId { grid, key }, *plane, offset))
+                let near = NearPlane {
+                    cell: CellId { grid, key },
+                    plane: *plane,
+                    segment: cell.segment(),
+                };
+                Some((near, offset))
             });
-            let nearest = found.min_by(|a, b| a.2.total_cmp(&b.2));
-            nearest.map(|(id, plane, _)| (id, plane))
+            let nearest = found.min_by(|a, b| a.1.total_cmp(&b.1));
+            nearest.map(|(near, _)| near)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_that_were_not_seen_for_long_are_forgotten() {
+        let mut map = SurfaceMap::new(RangeSensor::Scanner);
+        let wall = |x: f64| -> Vec<Point3<f64>> {
+            (0..400)
+                .map(|ix| Point3::new(x, 0.05 * f64::from(ix % 20), 0.05 * f64::from(ix / 20)))
+                .collect()
+        };
+        let walls = [0.05, 40.05].map(wall);
+        for (segment, points) in walls.iter().enumerate() {
+            map.add(points, segment);
+        }
+        let segments = |map: &SurfaceMap| {
+            [&walls[0], &walls[1]].map(|points| Some(map.plane_at(&points[210])?.segment))
+        };
+        assert_eq!(segments(&map), [Some(0), Some(1)]);
+        for grid in &mut map.grids {
+            let n_cells = grid.cells.len();
+            grid.forget_oldest(n_cells);
+            assert_eq!(grid.cells.len(), n_cells);
+            grid.forget_oldest(n_cells - 1);
+        }
+        assert_eq!(segments(&map), [None, Some(1)]);
     }
 }

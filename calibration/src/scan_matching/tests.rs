@@ -264,6 +264,13 @@ fn a_scan_without_known_surfaces_extends_the_map() {
     let there = far * here;
     assert!(tracker.add(&elsewhere, &there).is_none());
     assert!(tracker.add(&elsewhere, &there).is_some());
+    // The pose relative to the new surfaces is accurate, but these are as uncertain as odometry
+    // after 500 m. Back in the room, the pose is accurate again.
+    let sigma_m = |covariance: Matrix6<f64>| covariance.m11.sqrt();
+    assert!(sigma_m(tracker.covariance()) > 0.2);
+    let located = tracker.locate(&in_room, &here).expect("a known room");
+    assert!(sigma_m(located.covariance) < 0.01);
+    assert!(sigma_m(tracker.covariance_at(&here)) > 0.2);
     // Nothing can be matched with an empty scan.
     assert!(tracker.add(&[], &there).is_none());
 }

@@ -44,7 +44,7 @@ impl DepthTracking {
 
     /// The newest correction; `None` if depth images do not determine it.
     pub(super) fn newest(&self) -> Option<Tracked> {
-        tracked(self.tracked_from_odom, self.tracker.covariance())
+        tracked(self.tracked_from_odom, &self.tracker.covariance())
     }
 
     /// Adds a keyframe with its reported pose. Returns the correction for it.
@@ -54,9 +54,15 @@ impl DepthTracking {
         let depth = keyframe.depth.as_ref();
         let points = depth.map_or(Vec::new(), |depth| points(depth, &self.tracked_from_odom));
         if !is_usable(keyframe) {
-            // Test keyframes must not influence the poses of other keyframes.
-            let found = self.tracker.locate(&points, &world_from_base)?;
-            return tracked(found.motion * self.tracked_from_odom, &found.covariance);
+            // Test keyframes must not influence the poses of other keyframes. Keyframes without depth
+            // follow the newest one with depth, with the drift since then.
+            return match self.tracker.locate(&points, &world_from_base) {
+                Some(found) => tracked(found.motion * self.tracked_from_odom, &found.covariance),
+                None => {
+                    let covariance = self.tracker.covariance_at(&world_from_base);
+                    tracked(self.tracked_from_odom, &covariance)
+                }
+            };
         }
         if let Some(found) = self.tracker.add(&points, &world_from_base) {
             self.tracked_from_odom = found.motion * self.tracked_from_odom;

@@ -80,8 +80,9 @@ pub struct Stations {
     /// Changes received since registration of the next station started.
     queue: VecDeque<Waiting>,
     search: Option<Task<SearchResult>>,
-    /// Whether keyframes pass only with their final pose, so that their order does not depend on
-    /// the speed of the computer.
+    /// Whether the base is on the way to a station that is not registered yet.
+    is_on_way: bool,
+    /// Whether keyframes pass only with their final pose.
     is_final_only: bool,
     reported: Vec<StationReport>,
     /// Total time spent on registration.
@@ -246,6 +247,7 @@ impl Stations {
             held: Vec::new(),
             queue: VecDeque::new(),
             search: None,
+            is_on_way: false,
             is_final_only: false,
             reported: Vec::new(),
             spent: Duration::ZERO,
@@ -253,7 +255,8 @@ impl Stations {
     }
 
     /// Passes keyframes only with their final pose, and waits for it. The order of the keyframes
-    /// then does not depend on the speed of the computer.
+    /// then does not depend on the speed of the computer. Models that cannot remove a keyframe also
+    /// need this.
     #[must_use]
     pub fn final_only(mut self) -> Self {
         self.is_final_only = true;
@@ -384,6 +387,7 @@ impl Stations {
         let released = self.finish();
         self.tracking = DepthTracking::new();
         self.map_from_tracked = Some(Transform::identity());
+        self.is_on_way = false;
         self.station = None;
         self.world_from_base = Transform::identity();
         self.map_from_odom = Transform::identity();
@@ -412,10 +416,10 @@ impl Stations {
         }
     }
 
-    /// The current correction of reported base poses. It is provisional while keyframes wait for
-    /// their station.
+    /// The current correction of reported base poses. It is provisional until the station of the
+    /// newest keyframe is registered.
     pub(crate) fn map_from_odom(&self) -> Transform {
-        let tracked = self.tracking.newest().filter(|_| !self.held.is_empty());
+        let tracked = self.tracking.newest().filter(|_| self.is_on_way);
         provisional(self.map_from_tracked, tracked).unwrap_or(self.map_from_odom)
     }
 
@@ -481,6 +485,7 @@ impl Stations {
             && keyframe
                 .as_ref()
                 .is_none_or(|keyframe| self.is_at_current_station(keyframe));
+        self.is_on_way = !is_settled;
         if is_settled {
             let placed = keyframe.map(|keyframe| self.placed(keyframe));
             released.extend(waiting.settled(placed));
@@ -647,6 +652,7 @@ impl Stations {
             None if now != before => self.map_from_tracked = None,
             None => {}
         }
+        self.is_on_way = false;
         self.station = base_state.station;
         self.world_from_base = base_state.world_from_base;
         self.map_from_odom = now;

@@ -445,6 +445,39 @@ fn held_keyframes_are_released_in_order_after_a_limit() {
 }
 
 #[test]
+fn keyframes_without_depth_follow_those_with_depth() {
+    let mut stations = stations();
+    for keyframe in all().into_iter().take(28) {
+        stations.push(Change::Accepted(keyframe));
+    }
+    let without_depth = Keyframe {
+        camera: "color".into(),
+        depth: None,
+        ..(*keyframe(28)).clone()
+    };
+    let released = stations.push(Change::Accepted(Arc::new(without_depth)));
+    let [Change::Accepted(keyframe)] = &released[..] else {
+        panic!("{} changes", released.len())
+    };
+    let (mm, degrees) = base_error(keyframe);
+    assert!(mm < 8.0 && degrees < 0.2, "{mm} mm, {degrees}");
+}
+
+#[test]
+fn the_live_pose_does_not_jump_when_a_drive_takes_long() {
+    let mut stations = stations();
+    for keyframe in all().into_iter().take(29) {
+        stations.push(Change::Accepted(keyframe));
+    }
+    let before = stations.map_from_odom();
+    assert_ne!(before, Transform::identity());
+    assert!(!stations.held.is_empty());
+    stations.advance_to(Stamp::from_secs(14.0 + MAX_TRAVEL_SECS));
+    assert!(stations.held.is_empty());
+    assert_eq!(stations.map_from_odom(), before);
+}
+
+#[test]
 fn station_without_overlap_is_kept_and_reported() {
     let away = |keyframe: Arc<Keyframe>| match keyframe.base.as_ref().and_then(|base| base.station)
     {

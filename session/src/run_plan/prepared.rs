@@ -176,7 +176,8 @@ impl OpenedRun<'_> {
             .as_ref()
             .map_or(&[][..], |previous| &previous.keyframes);
         let devices = (source, stamp_clock);
-        let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), pace, devices, held)?;
+        let stations = stations(&rig, pace, &kinds, held);
+        let (mut input, evicted) = input(&plan, &rig, meshes.as_ref(), stations, devices, held)?;
         input.join = input.join.with_notes(device_notes.clone());
         let robot = publish_robot(&hub, &rig)?;
         let steering = steered
@@ -291,10 +292,17 @@ fn run_folder_of(folders: &[PathBuf]) -> &Path {
     run.unwrap_or(Path::new(""))
 }
 
-/// The corrections of a moving base. In lockstep, their order must not depend on the computer.
-fn stations(rig: &Rig, pace: Pace, previous: &[Arc<Keyframe>]) -> Option<Stations> {
+/// The corrections of a moving base. In lockstep, their order must not depend on the computer, and
+/// some models cannot revise keyframes.
+fn stations(
+    rig: &Rig,
+    pace: Pace,
+    kinds: &[ModelKind],
+    previous: &[Arc<Keyframe>],
+) -> Option<Stations> {
     let stations = Stations::new(rig)?.resume_from(previous);
-    Some(if pace == Pace::RealTime {
+    let can_revise = kinds.iter().all(|kind| kind.entry().can_revise);
+    Some(if pace == Pace::RealTime && can_revise {
         stations
     } else {
         stations.final_only()
@@ -307,7 +315,7 @@ fn input(
     plan: &RunPlan,
     rig: &Rig,
     meshes: Option<&RecordedMeshes>,
-    pace: Pace,
+    stations: Option<Stations>,
     (source, stamp_clock): (Box<dyn Source>, StampClock),
     previous: &[Arc<Keyframe>],
 ) -> anyhow::Result<(Input, Vec<Evicted>)> {
@@ -326,7 +334,7 @@ fn input(
     let input = Input {
         source,
         join,
-        stations: stations(rig, pace, previous),
+        stations,
         recorder,
         robot_motion: RobotMotion::new(rig),
         stamp_clock,

@@ -296,9 +296,13 @@ impl Schedule for Replay {
             &self.overrides(),
             progress,
         )?;
+        let mut n_pushed: HashMap<(&str, i64), usize> = HashMap::new();
+        for pushed in pushed() {
+            *n_pushed.entry(pushed.key()).or_default() += 1;
+        }
         let revised = data.keyframes.iter().filter(|keyframe| {
             let key = (&*keyframe.camera, keyframe.stamp.0);
-            pushed().filter(|pushed| pushed.key() == key).count() > 1
+            n_pushed.get(&key).is_some_and(|n| *n > 1)
         });
         let _ = self.revised.set(revised.cloned().collect());
         // The last pose of a keyframe is the one with which the run ended.

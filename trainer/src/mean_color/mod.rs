@@ -28,6 +28,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[COLOR_FILE],
     single_file: None,
     needs_depth: false,
+    can_revise: true,
     has_chunks: false,
     learnable: ParamSet::empty(),
     exports: &[],

@@ -16,6 +16,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[FIELD_FILE],
     single_file: None,
     needs_depth: false,
+    can_revise: true,
     has_chunks: false,
     learnable: ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS),
     exports: &[], // No other program can read the format.

@@ -27,6 +27,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
         unsupported_extensions: &UNSUPPORTED,
     }),
     needs_depth: false,
+    can_revise: true,
     has_chunks: true,
     learnable: ParamSet::EXTRINSICS
         .union(ParamSet::TIME_OFFSET)

@@ -22,6 +22,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[MESH_PLY, MESH_GLB, BLOCKS_FILE],
     single_file: None,
     needs_depth: true,
+    can_revise: false,
     has_chunks: true,
     learnable: ParamSet::empty(),
     exports: &[
