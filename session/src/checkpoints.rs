@@ -553,6 +553,7 @@ mod tests {
             checkpoints.requested = Some(CheckpointProgress::Writing);
             checkpoints.writer = Some(WriterThread {
                 thread: Task::start("checkpoint", move || result),
+                revised: Vec::new(),
                 is_checkpoint: true,
             });
             while checkpoints.requested() == Some(&CheckpointProgress::Writing) {

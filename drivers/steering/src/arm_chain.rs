@@ -360,24 +360,17 @@ impl ArmChain {
         }
     }
 
-    /// Fraction of full speed because of what is near.
+    /// Fraction of full speed because parts of the robot are close to each other.
     fn speed_scale(&self, here: &Surroundings, limits: &mut Vec<Limit>) -> f64 {
-        let own = self.self_collision.speed(&here.close_pairs, &self.body);
-        let scene = self
-            .clearance
-            .speed(&here.restrictions, &here.points_in_base, &self.body);
-        let mut slowest = 1.0;
-        for (link, (scale, reason)) in [(Link::SelfCollision, own), (Link::Clearance, scene)] {
-            if let (true, Some(reason)) = (scale < 1.0, reason) {
-                limits.push(Limit {
-                    link,
-                    effect: Effect::Slowed(scale),
-                    reason,
-                });
-            }
-            slowest = f64::min(slowest, scale);
+        let (scale, reason) = self.self_collision.speed(&here.close_pairs, &self.body);
+        if let (true, Some(reason)) = (scale < 1.0, reason) {
+            limits.push(Limit {
+                link: Link::SelfCollision,
+                effect: Effect::Slowed(scale),
+                reason,
+            });
         }
-        slowest
+        scale
     }
 
     /// The next target, and its distance from the scene. `None` if the target stays.
@@ -413,6 +406,15 @@ impl ArmChain {
             chain: &self.chain,
             inverse: self.inverse.as_ref(),
             body: &self.body,
+            too_fast: &|after: &[Capsule], max_step_m: f64| {
+                let Surroundings {
+                    restrictions,
+                    points_in_base,
+                    ..
+                } = here;
+                let points = &self.clearance;
+                points.excess(restrictions, points_in_base, after, max_step_m, &self.body)
+            },
         };
         let step = match self.limits.step(&model, q, &goal, pace) {
             Ok(step) => step,

@@ -1,7 +1,7 @@
 //! Fifth link: the arm keeps a distance from the scene, which is known only where and when it was
 //! seen.
 //!
-//! This file decides how fast the arm may move. The distances come from a model of the scene behind
+//! This file decides how fast each part may move. The distances come from a model of the scene behind
 //! the trait [`Clearance`].
 
 use crate::body::Body;
@@ -11,6 +11,7 @@ use crate::error::Error;
 use crate::ramp::{check_ramp, speed_scale};
 use crate::reason::Reason;
 use kinematics::Stamp;
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// Rounding of a product, so that a multiple of a step stays the same.
@@ -58,13 +59,13 @@ pub trait Clearance {
 pub struct ClearanceConfig {
     /// Distance from a surface below which no part approaches it any more.
     pub stop_m: f64,
-    /// Distance below which the arm is slower.
+    /// Distance below which a part is slower.
     pub slow_m: f64,
     /// Smallest fraction of full speed.
     pub creep_frac: f64,
-    /// Age up to which the arm moves at full speed.
+    /// Age up to which a part moves at full speed.
     pub fresh_secs: f64,
-    /// Age from which the arm moves at `stale_frac` of full speed.
+    /// Age from which a part moves at `stale_frac` of full speed.
     pub stale_secs: f64,
     /// Fraction of full speed in a region that was not seen for `stale_secs` or longer.
     pub stale_frac: f64,
@@ -260,23 +261,34 @@ impl ClearancePoints {
         restrictions
     }
 
-    /// Speed as a fraction of full speed, with its reason if it is less.
-    pub(crate) fn speed(
+    /// By which factor a step is too long for the point that most exceeds its maximum speed, and
+    /// why; `None` if all points are slow enough.
+    ///
+    /// Only the speed of what is near a surface matters. The shoulder of an arm on a table is always
+    /// near the table, but does not move toward it.
+    ///
+    /// * `here`: the restrictions at the begin of the step, at `points_in_base`.
+    /// * `after`: parts at the end of the step.
+    /// * `max_step_m`: distance of a part in a step at full speed.
+    pub(crate) fn excess(
         &self,
         here: &[Restriction],
         points_in_base: &[[f64; 3]],
+        after: &[Capsule],
+        max_step_m: f64,
         body: &Body,
-    ) -> (f64, Option<Reason>) {
-        let scale = |restriction: &Restriction| {
-            restriction
+    ) -> Option<(f64, Reason)> {
+        let points_after = self.in_base(after);
+        let ratios = here.iter().map(|restriction| {
+            let ix = restriction.point_ix;
+            let [from, to] = [points_in_base[ix], points_after[ix]].map(Vector3::from);
+            let scale = restriction
                 .seen
-                .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen))
-        };
-        let slowest = here.iter().min_by(|a, b| scale(a).total_cmp(&scale(b)));
-        slowest.map_or((1.0, None), |slowest| {
-            let reason = self.reason(slowest, points_in_base, body);
-            (scale(slowest), Some(reason))
-        })
+                .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen));
+            ((to - from).norm() / (scale * max_step_m), restriction)
+        });
+        let (ratio, worst) = ratios.max_by(|a, b| a.0.total_cmp(&b.0))?;
+        (ratio > 1.0).then(|| (ratio, self.reason(worst, points_in_base, body)))
     }
 
     /// Why the arm may not move to a close posture, if it may not. A motion away from a surface,

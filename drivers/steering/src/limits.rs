@@ -1,4 +1,5 @@
-//! Third link: how far the target moves in one cycle.
+//! Third link: how far the target moves in one cycle. Parts near the scene move less far, see
+//! [`ClearancePoints::excess`](crate::clearance::ClearancePoints::excess).
 //!
 //! The target moves in small steps from the last one toward the goal. Each step is limited in the
 //! speed of the tip, of every joint and of every part of the robot, so an elbow cannot swing fast
@@ -7,6 +8,7 @@
 //! the tip down.
 
 use crate::body::Body;
+use crate::capsule::Capsule;
 use crate::check::{check, positive};
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
@@ -89,6 +91,9 @@ pub(crate) struct Model<'a> {
     pub(crate) chain: &'a Chain,
     pub(crate) inverse: &'a dyn InverseKinematics,
     pub(crate) body: &'a Body,
+    /// By which factor a step is too long for what is near the scene, and why. It gets the parts at
+    /// the end of the step, and the distance of a part in a step at full speed, meters.
+    pub(crate) too_fast: &'a dyn Fn(&[Capsule], f64) -> Option<(f64, Reason)>,
 }
 
 /// Duration of a cycle, and the fraction of full speed.
@@ -317,12 +322,12 @@ impl Limits {
         }
         let mut next = toward;
         for _ in 0..MAX_ROUNDS {
-            let Some((ratio, reason)) = self.excess(model, q, &next, cycle) else {
+            let Some((ratio, link, reason)) = self.excess(model, q, &next, cycle) else {
                 return next;
             };
             let scale = 1.0 / ratio;
             limits.push(Limit {
-                link: Link::Limits,
+                link,
                 effect: Effect::Slowed(scale),
                 reason,
             });
@@ -340,7 +345,7 @@ impl Limits {
         q: &[f64],
         next: &[f64],
         cycle: f64,
-    ) -> Option<(f64, Reason)> {
+    ) -> Option<(f64, Link, Reason)> {
         /// Rounding of a step that was shortened to its limit.
         const ROUNDING: f64 = 1e-9;
         let mut worst = (1.0 + ROUNDING, None);
@@ -364,7 +369,14 @@ impl Limits {
                 }
             }
         }
-        worst.1.map(|reason| (worst.0, reason))
+        let near_scene = (model.too_fast)(&after, self.config.max_speed_m_s * cycle);
+        match (worst, near_scene) {
+            ((limit, _), Some((ratio, reason))) if ratio > limit => {
+                Some((ratio, Link::Clearance, reason))
+            }
+            ((ratio, Some(reason)), _) => Some((ratio, Link::Limits, reason)),
+            _ => None,
+        }
     }
 }
 
