@@ -93,9 +93,12 @@ impl Grid {
             return;
         }
         let mut seen_at: Vec<u64> = self.cells.values().map(Cell::seen_at).collect();
-        let middle = seen_at.len() / 2;
-        let median = *seen_at.select_nth_unstable(middle).1;
-        self.cells.retain(|_, cell| cell.seen_at() > median);
+        seen_at.sort_unstable();
+        // If more than half of the cells were last seen at the same time, they are forgotten
+        // together.
+        let [oldest, median] = [seen_at[0], seen_at[seen_at.len() / 2]];
+        let oldest_kept = median.max(oldest + 1);
+        self.cells.retain(|_, cell| cell.seen_at() >= oldest_kept);
     }
 }
 
