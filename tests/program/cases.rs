@@ -579,7 +579,10 @@ fn joint_states_of_ros() {
             test_support::skip("python3 is not installed");
             return;
         };
-        wait_for_datagram(RIG_ADDRESS);
+        if !has_datagram(RIG_ADDRESS) {
+            sender.kill().unwrap();
+            panic!("{mode}: the sender sends nothing");
+        }
         let (_, printed) = case.run(&["doctor", "rig.toml", "--listen", "2"]);
         sender.kill().unwrap();
         sender.wait().unwrap();
@@ -596,14 +599,13 @@ fn joint_states_of_ros() {
     }
 }
 
-/// Waits until a program sends to this address, on which nobody listens yet.
+/// Whether a program sends to this address within a minute. Nobody listens there yet.
 #[cfg(feature = "sim")]
-fn wait_for_datagram(address: &str) {
+fn has_datagram(address: &str) -> bool {
     let socket = std::net::UdpSocket::bind(address).expect("the address is free");
     let timeout = Some(std::time::Duration::from_secs(60));
     socket.set_read_timeout(timeout).expect("a valid timeout");
-    let received = socket.recv(&mut [0; 4096]);
-    assert!(received.is_ok_and(|n_bytes| n_bytes > 0));
+    socket.recv(&mut [0; 4096]).is_ok()
 }
 
 /// Number of samples of a device, as printed by `doctor --listen`.

@@ -16,7 +16,7 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
-use test_support::browser::{Browser, NO_DRAWING, Task, browser_for_page, wait_for};
+use test_support::browser::{Browser, NO_DRAWING, browser_for_page, wait_for};
 
 const WINDOW_PX: [u32; 2] = [1280, 720];
 /// How long the run is recorded after its first picture.
@@ -25,9 +25,9 @@ const RECORDED: Duration = Duration::from_secs(15);
 /// computer and the recording take together.
 const MAX_SECONDS: &str = "90";
 /// Limit of the 99th percentile of the CPU time of tasks, relative to a fixed piece of work on the
-/// same page ([`Browser::reference_millis`]). CPU time does not depend on the tests that run beside
+/// same page ([`Browser::trace_tasks`]). CPU time does not depend on the tests that run beside
 /// this one, and the ratio does not depend on the speed of the computer.
-const MAX_P99: f64 = 4.0;
+const MAX_P99: f64 = 1.2;
 /// Additional time for decoding an image on a slow computer.
 const SLOW_DECODING_MILLIS: u32 = 400;
 /// This script is added to the page. It counts decoded images, and the decoders that run at the
@@ -236,27 +236,12 @@ fn p99_of_tasks(program: &Path, session: &Session, speed: f64) -> f64 {
         let shown = "(document.getElementById('picture-info')?.dataset.shownRequest ?? '') !== ''";
         browser.evaluate(shown) == json!(true)
     });
-    let before_millis = replay.browser.reference_millis();
     let traced = session.duration().mul_f64(0.7 / speed);
     let tasks = replay.browser.trace_tasks(traced);
-    let reference_millis = 0.5 * (before_millis + replay.browser.reference_millis());
-    let percentile = |millis: fn(&Task) -> f64, share: usize| {
-        let mut millis: Vec<f64> = tasks.iter().map(millis).collect();
-        millis.sort_by(f64::total_cmp);
-        millis[(millis.len() - 1) * share / 1000]
-    };
-    let cpu: fn(&Task) -> f64 = |task| task.cpu_millis;
-    eprintln!(
-        "{speed} times the speed: {} tasks, CPU time: median {:.2} ms, 99 % {:.2} ms, longest {:.2} ms; duration 99 % {:.2} ms; reference {reference_millis:.2} ms",
-        tasks.len(),
-        percentile(cpu, 500),
-        percentile(cpu, 990),
-        percentile(cpu, 1000),
-        percentile(|task| task.millis, 990)
-    );
-    assert!(tasks.len() > 500, "only {} tasks", tasks.len());
+    eprintln!("{speed} times the speed:");
+    let p99 = tasks.relative_p99();
     replay.end();
-    percentile(cpu, 990) / reference_millis
+    p99
 }
 
 /// If images arrive faster than they can be decoded, at most one picture and one camera image is

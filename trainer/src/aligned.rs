@@ -23,7 +23,7 @@ use model_files::checkpoint::Checkpoint;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -183,10 +183,14 @@ impl AlignedModel {
         // Alignment needs the originals in the order in which they arrived. Their numbers must also
         // be the same as before, because alignment and the references of movements each use a
         // prefix of the list.
-        let originals: BTreeMap<_, _> = keyframes
-            .iter()
-            .map(|keyframe| (id_of(keyframe), keyframe))
-            .collect();
+        let mut originals: BTreeMap<_, &Arc<Keyframe>> = BTreeMap::new();
+        for keyframe in keyframes {
+            let original = originals.entry(id_of(keyframe)).or_insert(keyframe);
+            // After recovery, the earlier version of a revised keyframe is there without pixels.
+            if original.rgba_srgb.is_empty() {
+                *original = keyframe;
+            }
+        }
         let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
         // After recovery, evicted keyframes have no pixels. They are removed from the model, like
         // missing keyframes.
@@ -200,9 +204,14 @@ impl AlignedModel {
         let original_keyframes: Vec<_> = ids.iter().filter_map(with_pixels).collect();
 
         // These keyframes are not corrected here, because `push` corrects them.
+        let ixs: HashMap<_, usize> = corrected
+            .iter()
+            .enumerate()
+            .map(|(ix, keyframe)| (Arc::as_ptr(keyframe), ix))
+            .collect();
         let untrained = untrained
             .iter()
-            .filter_map(|keyframe| original(id_of(keyframe)))
+            .filter_map(|keyframe| keyframes.get(*ixs.get(&Arc::as_ptr(keyframe))?).cloned())
             .collect();
         let mut aligned = Self {
             model,

@@ -148,7 +148,7 @@ pub(crate) fn match_keyframes(
             missing.push(Arc::new(expected.placeholder()));
             continue;
         };
-        // A keyframe that was revised is there with several poses.
+        // If a keyframe was revised, the list may contain it several times, with different poses.
         let same = candidates
             .iter()
             .find(|keyframe| expected.difference(keyframe).is_none());

@@ -31,6 +31,8 @@ pub struct DriftTracker {
     relative: Matrix6<f64>,
     /// Covariance of these surfaces.
     of_surfaces: Matrix6<f64>,
+    /// The segment that most of these surfaces belong to.
+    segment: usize,
     /// Pose of the base at the last scan.
     last: Option<Transform>,
 }
@@ -53,8 +55,15 @@ impl DriftTracker {
             segments: Vec::new(),
             relative: Matrix6::zeros(),
             of_surfaces: Matrix6::zeros(),
+            segment: 0,
             last: None,
         }
+    }
+
+    /// Whether no scan was added yet.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.map.is_empty()
     }
 
     /// Covariance of the correction at the last scan, as in [`ScanMatch::covariance`]. Before the
@@ -84,9 +93,10 @@ impl DriftTracker {
         world_from_base: &Transform,
     ) -> Option<ScanMatch> {
         let prior = self.prior(world_from_base);
-        let Some((found, n_by_segment)) = self.match_with(points, world_from_base, &prior) else {
+        let Some((found, n_by_segment)) = self.matched(points, world_from_base) else {
             let covariance = self.covariance_at(world_from_base);
-            self.map.add(points, self.segments.len());
+            self.segment = self.segments.len();
+            self.map.add(points, self.segment);
             self.segments.push(Segment {
                 world_from_base: *world_from_base,
                 covariance,
@@ -99,11 +109,8 @@ impl DriftTracker {
         let moved: Vec<Point3<f64>> = points.iter().map(|point| found.motion * point).collect();
         let here = found.motion * world_from_base;
         // Surfaces that are seen for the first time are placed relative to known ones of a segment.
-        let (segment, _) = n_by_segment
-            .iter()
-            .max_by_key(|(_, n)| **n)
-            .expect("a match has points");
-        self.map.add(&moved, *segment);
+        self.segment = largest(&n_by_segment);
+        self.map.add(&moved, self.segment);
         self.relative = found.covariance;
         self.of_surfaces = self.of_surfaces(&n_by_segment, &here);
         self.last = Some(here);
@@ -116,13 +123,28 @@ impl DriftTracker {
     /// Matches a scan without adding it. See [`Self::add`].
     #[must_use]
     pub fn locate(&self, points: &[Point3<f64>], world_from_base: &Transform) -> Option<ScanMatch> {
-        let prior = self.prior(world_from_base);
-        let (found, n_by_segment) = self.match_with(points, world_from_base, &prior)?;
+        let (found, n_by_segment) = self.matched(points, world_from_base)?;
         let here = found.motion * world_from_base;
         Some(ScanMatch {
             covariance: found.covariance + self.of_surfaces(&n_by_segment, &here),
             ..found
         })
+    }
+
+    /// Matches a scan. Surfaces of another segment than before may have another error, so the
+    /// correction may change by the covariance of both.
+    fn matched(
+        &self,
+        points: &[Point3<f64>],
+        world_from_base: &Transform,
+    ) -> Option<(ScanMatch, BTreeMap<usize, usize>)> {
+        let prior = self.prior(world_from_base);
+        let found = self.match_with(points, world_from_base, &prior)?;
+        if largest(&found.1) == self.segment {
+            return Some(found);
+        }
+        let wider = self.covariance_at(world_from_base);
+        self.match_with(points, world_from_base, &wider)
     }
 
     /// Covariance of matched surfaces, seen from a pose of the base. All surfaces of a segment have
@@ -143,8 +165,8 @@ impl DriftTracker {
         weighted.sum()
     }
 
-    /// Covariance of the correction relative to the surfaces matched last, at a pose of the base
-    /// and before a match.
+    /// Covariance of the correction at a pose of the base before a match, relative to the surfaces
+    /// of the last match.
     fn prior(&self, world_from_base: &Transform) -> Matrix6<f64> {
         self.last.map_or(self.relative, |last| {
             carried(&self.relative, &last, world_from_base)
@@ -163,6 +185,12 @@ impl DriftTracker {
             .then(|| match_scan(&self.map, points, &base, prior))
             .flatten()
     }
+}
+
+/// The segment with the most points of a match.
+fn largest(n_by_segment: &BTreeMap<usize, usize>) -> usize {
+    let largest = n_by_segment.iter().max_by_key(|(_, n)| **n);
+    largest.map_or(0, |(segment, _)| *segment)
 }
 
 /// Covariance of the correction at another position of the base. A wrong rotation about the first

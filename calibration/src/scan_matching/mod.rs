@@ -31,9 +31,6 @@ const MIN_PLANES: usize = 6;
 const MAX_STEPS: usize = 20;
 /// Steps that are smaller than this end the search, meters and radians.
 const CONVERGED: f64 = 2e-5;
-/// Maximum size of the last of [`MAX_STEPS`] steps, relative to the error of a plane. Points at the
-/// limit of the distance may be matched in every second step, so some searches do not converge.
-const MAX_LAST_STEP: f64 = 0.5;
 /// Minimum information about a direction of translation, relative to the information that errors of
 /// normals give.
 const MIN_INFORMATION: f64 = 5.0;
@@ -126,8 +123,10 @@ struct Match {
 /// * `base`: position of the base in the same frame, meters.
 /// * `prior`: covariance of the motion that is still to be found, as in [`ScanMatch::covariance`].
 ///
-/// Returns `None` if too few points lie on known planes, or if the search does not converge. Also
-/// returns how many points were matched with the planes of each segment of the path.
+/// Returns `None` if too few points lie on known planes. Also returns how many points were matched
+/// with the planes of each segment of the path. Not every search converges, because points near the
+/// maximum distance may be matched in one step and not in the next. The last of [`MAX_STEPS`] steps
+/// is then added to the covariance.
 fn match_scan(
     map: &SurfaceMap,
     points: &[Point3<f64>],
@@ -161,12 +160,13 @@ fn match_scan(
         let cholesky = Cholesky::new(information)?;
         let change = -cholesky.solve(&gradient);
         motion = from_parameters(&change, base) * motion;
-        let max_change = if step + 1 < MAX_STEPS {
-            CONVERGED
-        } else {
-            MAX_LAST_STEP * map.sensor().plane_error_m()
-        };
-        if narrowed >= 1.0 && change.amax() < max_change {
+        let has_converged = narrowed >= 1.0 && change.amax() < CONVERGED;
+        if has_converged || step + 1 == MAX_STEPS {
+            let last_step = if has_converged {
+                Vector6::zeros()
+            } else {
+                change
+            };
             let squares: f64 = matches.iter().map(|of| of.distance_m * of.distance_m).sum();
             let mut n_by_segment = BTreeMap::new();
             for of in &matches {
@@ -174,7 +174,7 @@ fn match_scan(
             }
             let found = ScanMatch {
                 motion,
-                covariance: cholesky.inverse(),
+                covariance: cholesky.inverse() + last_step * last_step.transpose(),
                 n_matched: matches.len(),
                 rms_m: (squares / matches.len() as f64).sqrt(),
             };

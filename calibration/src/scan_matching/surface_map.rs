@@ -11,8 +11,8 @@ use rustc_hash::FxHashMap;
 const N_GRIDS: usize = 2;
 /// Maximum distance of a plane from the center of its cell, relative to the side of the cell.
 const MAX_OFFSET: f64 = 0.3;
-/// Maximum number of cells of a grid, which bounds the memory to about 0.5 GB. A grid that exceeds
-/// it forgets the half of its cells that was not seen for the longest time.
+/// Maximum number of cells of a grid, which bounds the memory to about 0.5 GB. A grid with more cells
+/// keeps the half of them that was seen last.
 const MAX_CELLS: usize = 200_000;
 
 /// Surfaces that were seen so far: planes in the cells of several grids.

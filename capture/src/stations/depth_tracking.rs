@@ -58,6 +58,7 @@ impl DepthTracking {
             // follow the newest one with depth, with the drift since then.
             return match self.tracker.locate(&points, &world_from_base) {
                 Some(found) => tracked(found.motion * self.tracked_from_odom, &found.covariance),
+                None if self.tracker.is_empty() => None,
                 None => {
                     let covariance = self.tracker.covariance_at(&world_from_base);
                     tracked(self.tracked_from_odom, &covariance)

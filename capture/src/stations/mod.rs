@@ -255,8 +255,8 @@ impl Stations {
     }
 
     /// Passes keyframes only with their final pose, and waits for it. The order of the keyframes
-    /// then does not depend on the speed of the computer. Models that cannot remove a keyframe also
-    /// need this.
+    /// then does not depend on the speed of the computer. It is also necessary for models that
+    /// cannot remove a keyframe.
     #[must_use]
     pub fn final_only(mut self) -> Self {
         self.is_final_only = true;
@@ -485,7 +485,9 @@ impl Stations {
             && keyframe
                 .as_ref()
                 .is_none_or(|keyframe| self.is_at_current_station(keyframe));
-        self.is_on_way = !is_settled;
+        if keyframe.as_ref().is_some_and(|of| of.base.is_some()) {
+            self.is_on_way = !is_settled;
+        }
         if is_settled {
             let placed = keyframe.map(|keyframe| self.placed(keyframe));
             released.extend(waiting.settled(placed));

@@ -474,6 +474,16 @@ fn the_live_pose_does_not_jump_when_a_drive_takes_long() {
     assert!(!stations.held.is_empty());
     stations.advance_to(Stamp::from_secs(14.0 + MAX_TRAVEL_SECS));
     assert!(stations.held.is_empty());
+    // Other changes say nothing about the base.
+    stations.push(Change::Evicted {
+        camera: "wrist".into(),
+        stamp: Stamp(0),
+    });
+    stations.push(Change::Accepted(Arc::new(Keyframe {
+        camera: "fixed".into(),
+        base: None,
+        ..(*keyframe(29)).clone()
+    })));
     assert_eq!(stations.map_from_odom(), before);
 }
 

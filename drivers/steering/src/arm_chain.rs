@@ -4,7 +4,7 @@ use crate::authority::Authority;
 use crate::body::Body;
 use crate::capsule::Capsule;
 use crate::check::{check, positive};
-use crate::clearance::{ClearanceConfig, ClearancePoints, Restriction};
+use crate::clearance::{ClearanceConfig, ClearancePoints, PartStep, Restriction};
 use crate::clutch::ClutchConfig;
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
@@ -406,14 +406,14 @@ impl ArmChain {
             chain: &self.chain,
             inverse: self.inverse.as_ref(),
             body: &self.body,
-            too_fast: &|after: &[Capsule], max_step_m: f64| {
+            near_scene: &|step: &PartStep<'_>| {
                 let Surroundings {
                     restrictions,
                     points_in_base,
                     ..
                 } = here;
                 let points = &self.clearance;
-                points.excess(restrictions, points_in_base, after, max_step_m, &self.body)
+                points.excess(restrictions, points_in_base, step, &self.body)
             },
         };
         let step = match self.limits.step(&model, q, &goal, pace) {

@@ -14,7 +14,7 @@ use kinematics::Stamp;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-/// Rounding of a product, so that a multiple of a step stays the same.
+/// Rounding of products and ratios. A multiple of a step, for example, stays the same.
 const ROUNDING: f64 = 1e-6;
 
 /// What is known about the surroundings of a point.
@@ -191,6 +191,19 @@ pub struct ClearancePoints {
     points: Vec<PartPoint>,
 }
 
+/// How the parts of a robot move in a step.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PartStep<'a> {
+    /// Parts at the end of the step.
+    pub(crate) after: &'a [Capsule],
+    /// Angle by which each frame of the body turns, radians.
+    pub(crate) turned_rad: &'a [f64],
+    /// Maximum distance of a part, meters.
+    pub(crate) max_m: f64,
+    /// Maximum angle of the tip, radians.
+    pub(crate) max_rad: f64,
+}
+
 /// A sphere in a part. The spheres of a part together cover it.
 #[derive(Clone, Debug)]
 struct PartPoint {
@@ -261,34 +274,44 @@ impl ClearancePoints {
         restrictions
     }
 
-    /// By which factor a step is too long for the point that most exceeds its maximum speed, and
-    /// why; `None` if all points are slow enough.
+    /// The largest ratio of the speed of a restricted point to its maximum speed, with the reason
+    /// of the restriction; `None` if all points are slow enough.
     ///
-    /// Only the speed of what is near a surface matters. The shoulder of an arm on a table is always
-    /// near the table, but does not move toward it.
+    /// Each restriction limits only the part that is near a surface. The shoulder of an arm on a
+    /// table is always near the table, but hardly moves. If a part turns, its surface also moves.
+    /// What the tip holds may be longer than the parts, so the angular speed of the tip is limited
+    /// as well.
     ///
     /// * `here`: the restrictions at the begin of the step, at `points_in_base`.
-    /// * `after`: parts at the end of the step.
-    /// * `max_step_m`: distance of a part in a step at full speed.
     pub(crate) fn excess(
         &self,
         here: &[Restriction],
         points_in_base: &[[f64; 3]],
-        after: &[Capsule],
-        max_step_m: f64,
+        step: &PartStep<'_>,
         body: &Body,
     ) -> Option<(f64, Reason)> {
-        let points_after = self.in_base(after);
+        let points_after = self.in_base(step.after);
         let ratios = here.iter().map(|restriction| {
             let ix = restriction.point_ix;
+            let point = &self.points[ix];
             let [from, to] = [points_in_base[ix], points_after[ix]].map(Vector3::from);
+            let frame_ix = body.part(point.part_ix).frame_ix;
+            let turned_rad = step.turned_rad[frame_ix];
+            let moved_m = (to - from).norm() + point.radius_m * turned_rad;
+            let ratio = moved_m / step.max_m;
+            let ratio = if body.is_tip(frame_ix) {
+                ratio.max(turned_rad / step.max_rad)
+            } else {
+                ratio
+            };
             let scale = restriction
                 .seen
                 .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen));
-            ((to - from).norm() / (scale * max_step_m), restriction)
+            (ratio / scale, restriction)
         });
         let (ratio, worst) = ratios.max_by(|a, b| a.0.total_cmp(&b.0))?;
-        (ratio > 1.0).then(|| (ratio, self.reason(worst, points_in_base, body)))
+        // A step that was shortened to its limit is not shortened again because of rounding.
+        (ratio > 1.0 + ROUNDING).then(|| (ratio, self.reason(worst, points_in_base, body)))
     }
 
     /// Why the arm may not move to a close posture, if it may not. A motion away from a surface,

@@ -8,8 +8,8 @@
 //! the tip down.
 
 use crate::body::Body;
-use crate::capsule::Capsule;
 use crate::check::{check, positive};
+use crate::clearance::PartStep;
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
 use crate::reason::{Effect, Limit, Link, Reason};
@@ -91,9 +91,9 @@ pub(crate) struct Model<'a> {
     pub(crate) chain: &'a Chain,
     pub(crate) inverse: &'a dyn InverseKinematics,
     pub(crate) body: &'a Body,
-    /// By which factor a step is too long for what is near the scene, and why. It gets the parts at
-    /// the end of the step, and the distance of a part in a step at full speed, meters.
-    pub(crate) too_fast: &'a dyn Fn(&[Capsule], f64) -> Option<(f64, Reason)>,
+    /// Ratio of the speed of a part near the scene to its maximum, if it is too fast; see
+    /// [`ClearancePoints::excess`](crate::clearance::ClearancePoints::excess).
+    pub(crate) near_scene: &'a dyn Fn(&PartStep<'_>) -> Option<(f64, Reason)>,
 }
 
 /// Duration of a cycle, and the fraction of full speed.
@@ -321,21 +321,44 @@ impl Limits {
             return q.to_vec();
         }
         let mut next = toward;
-        for _ in 0..MAX_ROUNDS {
-            let Some((ratio, link, reason)) = self.excess(model, q, &next, cycle) else {
-                return next;
-            };
-            let scale = 1.0 / ratio;
-            limits.push(Limit {
-                link,
-                effect: Effect::Slowed(scale),
-                reason,
-            });
-            for (next, q) in next.iter_mut().zip(q) {
-                *next = q + (*next - q) * scale;
+        // The scene comes last, so that its limit is relative to a motion that is possible elsewhere.
+        for link in [Link::Limits, Link::Clearance] {
+            for _ in 0..MAX_ROUNDS {
+                let excess = match link {
+                    Link::Clearance => self.excess_near_scene(model, q, &next, cycle),
+                    _ => self.excess(model, q, &next, cycle),
+                };
+                let Some((ratio, reason)) = excess else {
+                    break;
+                };
+                let scale = 1.0 / ratio;
+                limits.push(Limit {
+                    link,
+                    effect: Effect::Slowed(scale),
+                    reason,
+                });
+                for (next, q) in next.iter_mut().zip(q) {
+                    *next = q + (*next - q) * scale;
+                }
             }
         }
         next
+    }
+
+    /// By what factor a step is too long for what is near the scene, and why.
+    fn excess_near_scene(
+        &self,
+        model: &Model<'_>,
+        q: &[f64],
+        next: &[f64],
+        cycle: f64,
+    ) -> Option<(f64, Reason)> {
+        (model.near_scene)(&PartStep {
+            after: &model.body.capsules(next),
+            turned_rad: &model.body.turned_rad(q, next),
+            max_m: self.config.max_speed_m_s * cycle,
+            max_rad: self.config.max_angular_rad_s * cycle,
+        })
     }
 
     /// By what factor a step is too long, and why.
@@ -345,7 +368,7 @@ impl Limits {
         q: &[f64],
         next: &[f64],
         cycle: f64,
-    ) -> Option<(f64, Link, Reason)> {
+    ) -> Option<(f64, Reason)> {
         /// Rounding of a step that was shortened to its limit.
         const ROUNDING: f64 = 1e-9;
         let mut worst = (1.0 + ROUNDING, None);
@@ -369,14 +392,7 @@ impl Limits {
                 }
             }
         }
-        let near_scene = (model.too_fast)(&after, self.config.max_speed_m_s * cycle);
-        match (worst, near_scene) {
-            ((limit, _), Some((ratio, reason))) if ratio > limit => {
-                Some((ratio, Link::Clearance, reason))
-            }
-            ((ratio, Some(reason)), _) => Some((ratio, Link::Limits, reason)),
-            _ => None,
-        }
+        worst.1.map(|reason| (worst.0, reason))
     }
 }
 

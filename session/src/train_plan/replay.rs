@@ -191,10 +191,12 @@ impl Replay {
                 Decision::PauseGrowth(is_paused) => session.pause_growth(*is_paused)?,
                 // Starts training on the keyframes so far without a step.
                 Decision::Begin(_) => drop(step(session, 0)?),
+                // Checkpoints are written at the times of this run, not at those of the log. But a
+                // checkpoint seeds the keyframes that wait.
+                Decision::Checkpoint(_) => session.viewed().seed()?,
                 // Restored keyframes need no push, because the model of the checkpoint has them
-                // already. Checkpoints are written at the times of this run, not at those of the
-                // log.
-                Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
+                // already.
+                Decision::Restored(_) | Decision::End(_) => {}
             }
         }
         Ok(())

@@ -37,22 +37,22 @@ const SWIFTSHADER: [&str; 2] = ["--use-angle=swiftshader", "--enable-unsafe-swif
 const NO_ADDRESS_BAR: &str =
     "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup,WebUIOmniboxFullPopup";
 
-/// Time of a fixed piece of work, the shortest of several: numbers as text and back, sorting, and
-/// the layout of new elements.
+/// A fixed piece of work of a few milliseconds: numbers as text and back, sorting, and the layout of
+/// new elements. The layout of the page itself does not change.
 const REFERENCE_WORK: &str = "(() => {
-    const values = Array.from({ length: 4000 }, (_, ix) => Math.sin(ix));
-    const list = document.body.appendChild(document.createElement('div'));
-    let shortest = Infinity;
-    for (let run = 0; run < 20; run++) {
-        const began = performance.now();
-        const sorted = JSON.parse(JSON.stringify(values)).sort((a, b) => a - b);
-        const texts = sorted.slice(0, 400).map((value) => value.toFixed(3));
-        list.replaceChildren(...texts.map((text) => Object.assign(document.createElement('span'), { textContent: text })));
-        if (list.offsetHeight > 0) shortest = Math.min(shortest, performance.now() - began);
-    }
-    list.remove();
-    return shortest;
+    performance.mark('reference work');
+    const values = Array.from({ length: 2000 }, (_, ix) => Math.sin(ix));
+    const sorted = JSON.parse(JSON.stringify(values)).sort((a, b) => a - b);
+    const list = window.referenceList ??= document.body.appendChild(document.createElement('div'));
+    list.style.cssText = 'position: fixed; width: 100px; height: 100px; visibility: hidden; contain: strict';
+    const texts = sorted.slice(0, 100).map((value) => value.toFixed(3));
+    list.replaceChildren(...texts.map((text) => Object.assign(document.createElement('span'), { textContent: text })));
+    const isLaidOut = list.lastChild.offsetHeight > 0;
+    list.replaceChildren();
+    return isLaidOut;
 })()";
+/// Time between two of these pieces of work.
+const REFERENCE_PERIOD: Duration = Duration::from_millis(200);
 
 /// The hint at the first visit would cover a part of the view. This script makes the page believe
 /// that the browser has already shown the hint. Pages without an origin have no storage.
@@ -133,6 +133,43 @@ pub struct Task {
     pub millis: f64,
     /// CPU time, milliseconds, without the time for which other programs used the core.
     pub cpu_millis: f64,
+}
+
+/// Tasks of a page's main thread.
+#[derive(Clone, Debug, Default)]
+pub struct TracedTasks {
+    /// Tasks of the page.
+    pub of_page: Vec<Task>,
+    /// Tasks of fixed work. They measure how fast this computer runs pages at the same time.
+    pub reference: Vec<Task>,
+}
+
+impl TracedTasks {
+    /// The 99th percentile of the CPU time of the page's tasks, relative to the median of the fixed
+    /// work. Prints it with other figures.
+    pub fn relative_p99(&self) -> f64 {
+        let n_tasks = self.of_page.len();
+        assert!(n_tasks > 500, "only {n_tasks} tasks");
+        let sorted = |tasks: &[Task], millis: fn(&Task) -> f64| {
+            let mut millis: Vec<f64> = tasks.iter().map(millis).collect();
+            millis.sort_by(f64::total_cmp);
+            millis
+        };
+        let at = |sorted: &[f64], per_mille: usize| sorted[(sorted.len() - 1) * per_mille / 1000];
+        let cpu = sorted(&self.of_page, |task| task.cpu_millis);
+        let wall = sorted(&self.of_page, |task| task.millis);
+        let reference_millis = at(&sorted(&self.reference, |task| task.cpu_millis), 500);
+        let p99 = at(&cpu, 990) / reference_millis;
+        eprintln!(
+            "{n_tasks} tasks, CPU time: median {:.2} ms, 99 % {:.2} ms, longest {:.2} ms; duration 99 % {:.2} ms; \
+             fixed work {reference_millis:.2} ms, 99 % is {p99:.2} times as long",
+            at(&cpu, 500),
+            at(&cpu, 990),
+            at(&cpu, 1000),
+            at(&wall, 990)
+        );
+        p99
+    }
 }
 
 impl Process {
@@ -356,24 +393,19 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", event);
     }
 
-    /// Time in which the page does a fixed piece of work, milliseconds. It measures how fast this
-    /// computer runs pages.
-    pub fn reference_millis(&mut self) -> f64 {
-        let millis = self.evaluate(REFERENCE_WORK);
-        millis.as_f64().expect("the page can be laid out")
-    }
-
-    /// The tasks of the page's main thread within this time.
-    pub fn trace_tasks(&mut self, duration: Duration) -> Vec<Task> {
-        const MARK: &str = "thread of the page";
+    /// The tasks of the page's main thread within this time, and tasks of fixed work in between.
+    pub fn trace_tasks(&mut self, duration: Duration) -> TracedTasks {
         let session = std::mem::take(&mut self.session); // Tracing belongs to the browser, not to the page.
         self.call(
             "Tracing.start",
             json!({"traceConfig": {"includedCategories": ["toplevel", "blink.user_timing"]}}),
         );
         self.session = session;
-        self.evaluate(&format!("performance.mark('{MARK}') && 0"));
-        std::thread::sleep(duration);
+        let began = Instant::now();
+        while began.elapsed() < duration {
+            assert_eq!(self.evaluate(REFERENCE_WORK), json!(true));
+            std::thread::sleep(REFERENCE_PERIOD);
+        }
         let session = std::mem::take(&mut self.session);
         self.call("Tracing.end", json!({}));
         let mut events: Vec<Value> = Vec::new();
@@ -393,18 +425,36 @@ impl Browser {
         self.session = session;
         // Other pages, such as those of the browser itself, have threads of the same name.
         let thread = |event: &Value| [event["pid"].clone(), event["tid"].clone()];
-        let mark = events.iter().find(|event| event["name"] == MARK);
-        let main_thread = thread(mark.expect("the page has set a mark"));
-        let is_task = |event: &&Value| {
-            event["name"] == "ThreadControllerImpl::RunTask" && thread(event) == main_thread
-        };
-        let task = |event: &Value| {
-            Some(Task {
-                millis: event["dur"].as_f64()? * 1e-3,
-                cpu_millis: event["tdur"].as_f64()? * 1e-3,
-            })
-        };
-        events.iter().filter(is_task).filter_map(task).collect()
+        let is_mark = |event: &&Value| event["name"] == "reference work";
+        let marks: Vec<&Value> = events.iter().filter(is_mark).collect();
+        let main_thread = thread(marks.first().expect("the page has set marks"));
+        let marks: Vec<f64> = marks
+            .iter()
+            .filter_map(|mark| mark["ts"].as_f64())
+            .collect();
+        let mut tasks = TracedTasks::default();
+        for event in &events {
+            if event["name"] != "ThreadControllerImpl::RunTask" || thread(event) != main_thread {
+                continue;
+            }
+            let times = ["ts", "dur", "tdur"].map(|name| event[name].as_f64());
+            let [Some(start), Some(duration), Some(cpu)] = times else {
+                continue;
+            };
+            let is_reference = marks
+                .iter()
+                .any(|at| (start..=start + duration).contains(at));
+            let list = if is_reference {
+                &mut tasks.reference
+            } else {
+                &mut tasks.of_page
+            };
+            list.push(Task {
+                millis: duration * 1e-3,
+                cpu_millis: cpu * 1e-3,
+            });
+        }
+        tasks
     }
 
     /// Screenshot of the page as PNG.

@@ -40,10 +40,16 @@ const PLAY: &str = "(async () => {
     video.src = window.createUrl(window.file);
     await event('loadeddata');
     // The event of a seek may come before the frame can be drawn.
-    const shown = new Promise((done) => {
-        const check = (_, { mediaTime }) =>
-            Math.abs(mediaTime - FRAME / 30) < 0.5 / 30 ? done() : video.requestVideoFrameCallback(check);
+    const shown = new Promise((done, failed) => {
+        let newest = 'no frame';
+        const check = (_, { mediaTime }) => {
+            newest = `a frame of ${mediaTime} s`;
+            if (Math.abs(mediaTime - FRAME / 30) < 0.5 / 30) done();
+            else video.requestVideoFrameCallback(check);
+        };
         video.requestVideoFrameCallback(check);
+        video.addEventListener('error', () => failed(video.error?.message), { once: true });
+        setTimeout(() => failed(`at ${video.currentTime} s, ${newest} is shown`), 120000);
     });
     video.currentTime = (FRAME + 0.5) / 30;
     await shown;

@@ -102,6 +102,27 @@ fn a_surface_near_the_shoulder_does_not_slow_the_hand() {
     assert!(near_m < ClearanceConfig::default().slow_m, "{near_m}");
 }
 
+/// The operator may hold something that is longer than the hand.
+#[test]
+fn the_hand_turns_slowly_near_a_surface() {
+    let turned_rad = |gap_m: f64| {
+        let mut sim = Sim::ready(ageless());
+        let start = sim.tip();
+        let (ball, _) = ball_below(&sim, gap_m);
+        sim.scene = Box::new(scene(vec![ball]));
+        let turned = start * Transform::rotation(Vector3::z() * 1.5);
+        for _ in 0..40 {
+            sim.drive(Some(1), pose_intent(&turned));
+        }
+        sim.tip().rotation.angle_to(&start.rotation)
+    };
+    let [far_rad, near_rad] = [1.0, 0.08].map(turned_rad);
+    assert!(
+        near_rad > 0.05 * far_rad && near_rad < 0.5 * far_rad,
+        "{near_rad} {far_rad}"
+    );
+}
+
 /// Distance of a ball from the parts that move with the joints.
 fn nearest_m(sim: &Sim, q: &[f64], center: Vector3<f64>) -> f64 {
     let body = crate::Body::new(&super::panda().0, &sim.chain, &|_| None).unwrap();

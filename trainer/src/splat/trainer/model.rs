@@ -174,6 +174,15 @@ impl TrainedModel {
         Ok(())
     }
 
+    /// Maximum number of splats.
+    pub(super) fn limit(&self) -> u32 {
+        if self.is_full {
+            self.splats.capacity.min(self.max_splats)
+        } else {
+            self.max_splats
+        }
+    }
+
     /// Whether GPU memory is too small for more splats.
     pub(super) fn is_full(&self) -> bool {
         self.is_full
@@ -217,6 +226,6 @@ fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
     }
 }
 
-fn n_splats_u32(n: usize) -> u32 {
+pub(super) fn n_splats_u32(n: usize) -> u32 {
     u32::try_from(n).expect("at most the limit, which is a u32")
 }

@@ -15,6 +15,10 @@ use gpu::Buffer;
 /// training step at full resolution. With fewer views, splats that only the skipped views show
 /// would be pruned.
 const MAX_VIEWS: usize = 64;
+/// Fractions of the limit: the smallest and the largest number of splats that are removed at once.
+/// With a smaller number, the model would be copied for every new image. With a larger one, a few
+/// new images would replace most of the model.
+const REMOVED_FRACS: [f64; 2] = [1.0 / 16.0, 1.0 / 4.0];
 
 /// Contribution of each splat to the views. It is the sum of the splat's blending weights, in
 /// pixels.
@@ -110,12 +114,61 @@ pub(super) fn keep_most_contributing(training: &mut Training, n_kept: u32) -> Re
     });
     by_contribution.truncate(n_kept as usize);
     by_contribution.sort_unstable();
-    training.model.splats = gather_splats(
-        &mut training.recorder,
-        &training.model.splats,
-        &learn,
-        &by_contribution,
-    )?;
+    keep(training, &learn, &by_contribution, n_kept)
+}
+
+/// Removes the splats with the lowest opacity if `n_new` splats would exceed the limit.
+///
+/// In a live run, growth may reach the limit while the images show only the first places. Later
+/// places would then get no splats. Without memory for a copy of the model, it keeps its splats.
+pub(super) fn make_room(training: &mut Training, n_new: u32) -> Result<(), Error> {
+    let n_splats = training.model.splats.n_splats;
+    let limit = training.model.limit();
+    let n_excess = n_splats.saturating_add(n_new).saturating_sub(limit);
+    if n_excess == 0 {
+        return Ok(());
+    }
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a fraction of a u32"
+    )]
+    let [smallest, largest] = REMOVED_FRACS.map(|frac| (frac * f64::from(limit)) as u32);
+    let n_removed = n_excess.clamp(smallest, largest).min(n_splats / 2);
+    if n_removed == 0 || !training.has_room_for_copy {
+        return Ok(());
+    }
+    training.finish_in_flight()?;
+    let learn = training.learn()?;
+    let gpu = &training.recorder.gpu;
+    let shapes: Vec<[f32; 4]> = gpu.read(&training.model.splats.shapes, n_splats as usize)?;
+    let mut by_opacity: Vec<u32> = (0..n_splats).collect();
+    by_opacity.select_nth_unstable_by(n_removed as usize, |a, b| {
+        let opacity = |ix: &u32| shapes[*ix as usize][3];
+        opacity(a).total_cmp(&opacity(b)).then(a.cmp(b))
+    });
+    let mut kept = by_opacity.split_off(n_removed as usize);
+    kept.sort_unstable();
+    let capacity = training.model.splats.capacity;
+    match keep(training, &learn, &kept, capacity) {
+        Err(error) if error.is_out_of_memory() => {
+            training.model.stop_growing(&error);
+            training.has_room_for_copy = false;
+            Ok(())
+        }
+        kept => kept,
+    }
+}
+
+/// Keeps the splats with these indices. `capacity`: number of splats for which there is memory.
+fn keep(
+    training: &mut Training,
+    learn: &TrainPipelines,
+    kept: &[u32],
+    capacity: u32,
+) -> Result<(), Error> {
+    let splats = &training.model.splats;
+    training.model.splats = gather_splats(&mut training.recorder, splats, learn, kept, capacity)?;
     training.recorder.passes.clear_bindings();
     Ok(())
 }
@@ -134,10 +187,11 @@ fn gather_splats(
     splats: &SplatBuffers,
     learn: &TrainPipelines,
     kept: &[u32],
+    capacity: u32,
 ) -> Result<SplatBuffers, Error> {
     let Recorder { gpu, passes } = recorder;
     let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
-    let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
+    let mut fewer = SplatBuffers::new(gpu, capacity, splats.sh_degree)?;
     let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
     // One kernel copies all buffers, because it treats each entry as a number of words. Planes of
     // one buffer are as far apart as the capacity, which differs between the two models.
@@ -174,6 +228,7 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::splat::SplatTrainer;
+    use crate::splat::trainer::model::n_splats_u32;
     use crate::splat::training_tests::{n_keyframes, noisy, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -234,6 +289,42 @@ mod tests {
             covered > 0.2 * n_pixels as f64 && (reported / covered - 1.0).abs() < 1e-4,
             "{reported} of {covered}"
         );
+    }
+
+    #[test]
+    fn the_least_opaque_splats_make_room_for_new_ones() {
+        let (mut trainer, _) = some_trained(120);
+        let training = &mut trainer.training;
+        let gpu = Arc::clone(&training.recorder.gpu);
+        let before = training.model.splats.read(&gpu).unwrap();
+        let limit = training.model.limit() as usize;
+        let n_free = limit - before.n_splats();
+        // Nothing is removed while there is room.
+        make_room(training, n_splats_u32(n_free)).unwrap();
+        assert_eq!(training.model.splats.read(&gpu).unwrap(), before);
+        // One splat too many frees a sixteenth, and as many as the limit free a quarter.
+        let mut n_expected = before.n_splats();
+        for (n_new, n_removed) in [(n_free + 1, limit / 16), (limit, limit / 4)] {
+            let before = training.model.splats.read(&gpu).unwrap();
+            make_room(training, n_splats_u32(n_new)).unwrap();
+            let after = training.model.splats.read(&gpu).unwrap();
+            let n_removed = n_removed.min(before.n_splats() / 2);
+            n_expected -= n_removed;
+            assert_eq!(after.n_splats(), n_expected);
+            let mut by_opacity: Vec<usize> = (0..before.n_splats()).collect();
+            by_opacity
+                .sort_by(|a, b| before.opacity_logits[*a].total_cmp(&before.opacity_logits[*b]));
+            let removed = &by_opacity[..n_removed];
+            assert_eq!(after, before.filtered(|ix| !removed.contains(&ix)));
+        }
+        // New splats are added within the limit, and training goes on.
+        let added = before.filtered(|ix| ix < limit / 8);
+        training.add(&added).unwrap();
+        assert_eq!(
+            training.model.splats.n_splats as usize,
+            n_expected + added.n_splats()
+        );
+        train(&mut trainer, 10);
     }
 
     #[test]

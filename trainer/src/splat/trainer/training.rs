@@ -3,7 +3,8 @@
 
 use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
-use super::model::TrainedModel;
+use super::model::{TrainedModel, n_splats_u32};
+use super::model_size;
 use super::optimizer::{Optimizer, StepContext};
 use super::recorder::Recorder;
 use super::renderer::Renderer;
@@ -49,6 +50,8 @@ pub(super) struct Training {
     pub(super) seeding: Seeding,
     /// Background loaded with a saved model.
     pub(super) saved_background_srgb: [f32; 3],
+    /// Whether the memory was large enough for a copy of the model, whenever one was made.
+    pub(super) has_room_for_copy: bool,
     skipped: SkippedSteps,
 }
 
@@ -69,6 +72,7 @@ impl Training {
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
             saved_background_srgb: [0.0; 3],
+            has_room_for_copy: true,
             skipped: SkippedSteps::default(),
             recorder: Recorder::new(gpu),
             options,
@@ -102,12 +106,20 @@ impl Training {
     }
 
     /// Seeds discs at the uncovered depth readings of the keyframes that arrived since the last
-    /// call.
+    /// call. At the limit, the result depends on how keyframes are divided between calls.
     pub(super) fn seed_from_depth(&mut self) -> Result<(), Error> {
-        match self.seeding.discs_from_depth(&self.views) {
-            Some(discs) => self.add(&discs),
-            None => Ok(()),
+        let discs = self.seeding.discs_from_depth(&self.views);
+        self.add_seeds(discs.as_slice())
+    }
+
+    /// Adds the splats of new images. At the limit, other splats make room for them.
+    fn add_seeds(&mut self, seeds: &[SplatArrays]) -> Result<(), Error> {
+        let n_seeds = seeds.iter().map(SplatArrays::n_splats).sum();
+        // Before the first step, no splat is less important than another.
+        if self.schedule.step > 0 {
+            model_size::make_room(self, n_splats_u32(n_seeds))?;
         }
+        seeds.iter().try_for_each(|seeds| self.add(seeds))
     }
 
     /// Seeds the areas that depth does not cover. If any keyframe has depth, discs are used.
@@ -117,17 +129,17 @@ impl Training {
     pub(super) fn prepare_model(&mut self) -> Result<(), Error> {
         // Depth comes first, because discs without depth readings take their depths from the discs
         // with depth.
-        self.seed_from_depth()?;
+        let mut seeds: Vec<SplatArrays> = Vec::new();
+        seeds.extend(self.seeding.discs_from_depth(&self.views));
         let unseeded = self.seeding.take_unseeded();
         if self.seeding.scene.has_depth {
-            for keyframe in &unseeded {
-                if let Some(discs) = self.seeding.discs_without_depth(keyframe) {
-                    self.add(&discs)?;
-                }
-            }
+            let seeding = &mut self.seeding;
+            let discs = unseeded.iter();
+            seeds.extend(discs.filter_map(|keyframe| seeding.discs_without_depth(keyframe)));
         } else if self.seeding.points.is_none() && !unseeded.is_empty() {
-            self.seed_from_images(&unseeded)?;
+            seeds.extend(self.seeds_from_images(&unseeded));
         }
+        self.add_seeds(&seeds)?;
         if !self.model.cameras.set.is_empty() {
             self.views
                 .assign_lenses(&self.recorder.gpu, &mut self.model.cameras)?;
@@ -152,10 +164,9 @@ impl Training {
         Ok(())
     }
 
-    /// Seeds the keyframes that arrived without depth, from what they and other images show.
-    fn seed_from_images(&mut self, arrived: &[Arc<Keyframe>]) -> Result<(), Error> {
-        let (discs, poor) = self.seeding.discs_from_images(arrived, &self.views);
-        discs.iter().try_for_each(|discs| self.add(discs))?;
+    /// Seeds for the keyframes that arrived without depth, from what they and other images show.
+    fn seeds_from_images(&mut self, arrived: &[Arc<Keyframe>]) -> Vec<SplatArrays> {
+        let (mut seeds, poor) = self.seeding.discs_from_images(arrived, &self.views);
         let all: Vec<&Keyframe> = self.views.keyframes().map(AsRef::as_ref).collect();
         let poor: Vec<&Keyframe> = poor.iter().map(AsRef::as_ref).collect();
         let n_before = all.len() - arrived.len();
@@ -163,8 +174,13 @@ impl Training {
         let seed = self.options.common.seed ^ n_before as u64;
         let n_random = self.seeding.random_splats() as usize;
         let n_max = seed::random_left(n_random, n_before).min(self.options.cap() as usize);
-        let cloud = seed::random_cloud(&poor, seed::common_focus(&all), seed, n_max);
-        self.add(&cloud)
+        seeds.push(seed::random_cloud(
+            &poor,
+            seed::common_focus(&all),
+            seed,
+            n_max,
+        ));
+        seeds
     }
 
     /// Queues at most `n` steps in one submit, see [`Method::step`](crate::Method::step). Returns

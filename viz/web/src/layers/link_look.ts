@@ -45,10 +45,13 @@ export class LinkLook implements Look {
     let material = this.materials.get(key);
     if (!material) {
       const [red, green, blue, opacity] = color as [number, number, number, number];
-      material = this.occlusion.apply(
-        new THREE.MeshLambertMaterial({ color: new THREE.Color(red, green, blue), side: THREE.DoubleSide }),
-        SOLID,
-      );
+      const look = new THREE.MeshLambertMaterial({
+        color: new THREE.Color(red, green, blue),
+        side: THREE.DoubleSide,
+        // Two passes would prepare the shader of each faint part again in every frame.
+        forceSinglePass: true,
+      });
+      material = this.occlusion.apply(look, SOLID);
       material.userData.opacity = opacity;
       this.materials.set(key, material);
       this.apply();

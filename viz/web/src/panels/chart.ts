@@ -34,7 +34,8 @@ export class Chart {
   }
 
   set(points: Curve, others: Curve[]): void {
-    const shown = JSON.stringify([points, others]);
+    // The canvas has another number of pixels on another screen.
+    const shown = JSON.stringify([points, others, devicePixelRatio]);
     if (shown === this.shown) return;
     this.shown = shown;
     this.points = finite(points);
