@@ -9,7 +9,7 @@ use crate::splat::buffers::{SplatBuffers, n_sh_rest};
 use crate::splat::camera_params::CameraParams;
 use crate::splat::kernels::TrainPipelines;
 use crate::splat::options::SplatOptions;
-use crate::splat::params::{Growth, MIN_OPACITY};
+use crate::splat::params::{Gathering, Growth, MIN_OPACITY};
 use crate::splat::passes::{self, GrowthBuffers};
 use gpu::Gpu;
 use model_files::splat::arrays::SplatArrays;
@@ -19,6 +19,11 @@ use model_files::splat::arrays::SplatArrays;
 /// as its parent did. With a smaller spread, the members of the family take longer to separate.
 const CHILD_SPREAD: f32 = 0.5;
 
+/// Fractions of the limit: the smallest and the largest number of splats that are removed at once.
+/// With a smaller number, the model would be copied for every new image. With a larger one, a few
+/// new images would replace most of the model.
+const REMOVED_FRACS: [f64; 2] = [1.0 / 16.0, 1.0 / 4.0];
+
 /// Splats and camera parameters in training.
 #[derive(Debug)]
 pub(super) struct TrainedModel {
@@ -27,6 +32,8 @@ pub(super) struct TrainedModel {
     max_splats: u32,
     /// Whether the GPU has no memory left for more splats.
     is_full: bool,
+    /// Whether the memory was large enough for a copy of the model, whenever one was made.
+    has_room_for_copy: bool,
     /// Whether only new images add splats, because larger models would be too slow.
     pub(super) is_growth_paused: bool,
 }
@@ -39,6 +46,7 @@ impl TrainedModel {
             cameras: CameraParams::new(gpu, options.common.cameras.always())?,
             max_splats: options.cap(),
             is_full: false,
+            has_room_for_copy: true,
             is_growth_paused: false,
         })
     }
@@ -174,6 +182,63 @@ impl TrainedModel {
         Ok(())
     }
 
+    /// Number of splats to remove before `n_new` splats are added; 0 if the limit is not exceeded.
+    pub(super) fn n_to_remove(&self, n_new: u32) -> u32 {
+        let (n_splats, limit) = (self.splats.n_splats, self.limit());
+        let n_excess = n_splats.saturating_add(n_new).saturating_sub(limit);
+        if n_excess == 0 || !self.has_room_for_copy {
+            return 0;
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a fraction of a u32"
+        )]
+        let [smallest, largest] = REMOVED_FRACS.map(|frac| (frac * f64::from(limit)) as u32);
+        n_excess.clamp(smallest, largest).min(n_splats / 2)
+    }
+
+    /// Removes the splats with the lowest opacity. Without memory for a copy of the model, it keeps
+    /// its splats.
+    pub(super) fn remove_faintest(
+        &mut self,
+        recorder: &mut Recorder,
+        learn: &TrainPipelines,
+        n_removed: u32,
+    ) -> Result<(), Error> {
+        let n_splats = self.splats.n_splats;
+        let shapes: Vec<[f32; 4]> = recorder.gpu.read(&self.splats.shapes, n_splats as usize)?;
+        let mut by_opacity: Vec<u32> = (0..n_splats).collect();
+        by_opacity.select_nth_unstable_by(n_removed as usize, |a, b| {
+            let opacity = |ix: &u32| shapes[*ix as usize][3];
+            opacity(a).total_cmp(&opacity(b)).then(a.cmp(b))
+        });
+        let mut kept = by_opacity.split_off(n_removed as usize);
+        kept.sort_unstable();
+        match self.keep(recorder, learn, &kept, self.splats.capacity) {
+            Err(error) if error.is_out_of_memory() => {
+                self.has_room_for_copy = false;
+                self.stop_growing(&error);
+                Ok(())
+            }
+            kept => kept,
+        }
+    }
+
+    /// Keeps the splats with these indices, in increasing order. `capacity`: number of splats for
+    /// which there is memory.
+    pub(super) fn keep(
+        &mut self,
+        recorder: &mut Recorder,
+        learn: &TrainPipelines,
+        kept: &[u32],
+        capacity: u32,
+    ) -> Result<(), Error> {
+        self.splats = gather_splats(recorder, &self.splats, learn, kept, capacity)?;
+        recorder.passes.clear_bindings();
+        Ok(())
+    }
+
     /// Maximum number of splats.
     pub(super) fn limit(&self) -> u32 {
         if self.is_full {
@@ -202,6 +267,47 @@ impl TrainedModel {
             );
         }
     }
+}
+
+/// Copies the splats with the given indices, including their moments.
+fn gather_splats(
+    recorder: &mut Recorder,
+    splats: &SplatBuffers,
+    learn: &TrainPipelines,
+    kept: &[u32],
+    capacity: u32,
+) -> Result<SplatBuffers, Error> {
+    let Recorder { gpu, passes } = recorder;
+    let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
+    let mut fewer = SplatBuffers::new(gpu, capacity, splats.sh_degree)?;
+    let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
+    // One kernel copies all buffers, because it treats each entry as a number of words. Planes of
+    // one buffer are as far apart as the capacity, which differs between the two models.
+    for ((from, n_planes, bytes), (to, _, _)) in splats.planes().iter().zip(fewer.planes()) {
+        let words = u32::try_from(bytes / 4).expect("an entry has a few words");
+        let gathering = Gathering {
+            n_kept,
+            n_planes: *n_planes,
+            words,
+            from_capacity: splats.capacity,
+            to_capacity: fewer.capacity,
+        };
+        let buffers = [
+            (
+                "gathering",
+                &gpu.uniform_with("splat.gathering", &gathering),
+            ),
+            ("kept", &indices),
+            ("from_words", *from),
+            ("to_words", to),
+        ];
+        let n_words = u64::from(n_kept) * u64::from(words) * u64::from(*n_planes);
+        passes.dispatch(gpu, &learn.gather, n_words.div_ceil(256), &buffers);
+    }
+    passes.submit(gpu);
+    fewer.set_active_degree(gpu, splats.active_degree());
+    fewer.set_n_splats(gpu, n_kept);
+    Ok(fewer)
 }
 
 /// Picks `n` splats at even intervals of the list.

@@ -6,19 +6,14 @@ use super::recorder::Recorder;
 use super::training::Training;
 use super::view_set::VIEWS_AT_ONCE;
 use crate::Error;
-use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
-use crate::splat::params::{Gathering, status};
+use crate::splat::params::status;
 use gpu::Buffer;
 
 /// Maximum number of views over which contributions are summed. Each view takes about as long as a
 /// training step at full resolution. With fewer views, splats that only the skipped views show
 /// would be pruned.
 const MAX_VIEWS: usize = 64;
-/// Fractions of the limit: the smallest and the largest number of splats that are removed at once.
-/// With a smaller number, the model would be copied for every new image. With a larger one, a few
-/// new images would replace most of the model.
-const REMOVED_FRACS: [f64; 2] = [1.0 / 16.0, 1.0 / 4.0];
 
 /// Contribution of each splat to the views. It is the sum of the splat's blending weights, in
 /// pixels.
@@ -114,63 +109,9 @@ pub(super) fn keep_most_contributing(training: &mut Training, n_kept: u32) -> Re
     });
     by_contribution.truncate(n_kept as usize);
     by_contribution.sort_unstable();
-    keep(training, &learn, &by_contribution, n_kept)
-}
-
-/// Removes the splats with the lowest opacity if `n_new` splats would exceed the limit.
-///
-/// In a live run, growth may reach the limit while the images show only the first places. Later
-/// places would then get no splats. Without memory for a copy of the model, it keeps its splats.
-pub(super) fn make_room(training: &mut Training, n_new: u32) -> Result<(), Error> {
-    let n_splats = training.model.splats.n_splats;
-    let limit = training.model.limit();
-    let n_excess = n_splats.saturating_add(n_new).saturating_sub(limit);
-    if n_excess == 0 {
-        return Ok(());
-    }
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "a fraction of a u32"
-    )]
-    let [smallest, largest] = REMOVED_FRACS.map(|frac| (frac * f64::from(limit)) as u32);
-    let n_removed = n_excess.clamp(smallest, largest).min(n_splats / 2);
-    if n_removed == 0 || !training.has_room_for_copy {
-        return Ok(());
-    }
-    training.finish_in_flight()?;
-    let learn = training.learn()?;
-    let gpu = &training.recorder.gpu;
-    let shapes: Vec<[f32; 4]> = gpu.read(&training.model.splats.shapes, n_splats as usize)?;
-    let mut by_opacity: Vec<u32> = (0..n_splats).collect();
-    by_opacity.select_nth_unstable_by(n_removed as usize, |a, b| {
-        let opacity = |ix: &u32| shapes[*ix as usize][3];
-        opacity(a).total_cmp(&opacity(b)).then(a.cmp(b))
-    });
-    let mut kept = by_opacity.split_off(n_removed as usize);
-    kept.sort_unstable();
-    let capacity = training.model.splats.capacity;
-    match keep(training, &learn, &kept, capacity) {
-        Err(error) if error.is_out_of_memory() => {
-            training.model.stop_growing(&error);
-            training.has_room_for_copy = false;
-            Ok(())
-        }
-        kept => kept,
-    }
-}
-
-/// Keeps the splats with these indices. `capacity`: number of splats for which there is memory.
-fn keep(
-    training: &mut Training,
-    learn: &TrainPipelines,
-    kept: &[u32],
-    capacity: u32,
-) -> Result<(), Error> {
-    let splats = &training.model.splats;
-    training.model.splats = gather_splats(&mut training.recorder, splats, learn, kept, capacity)?;
-    training.recorder.passes.clear_bindings();
-    Ok(())
+    training
+        .model
+        .keep(&mut training.recorder, &learn, &by_contribution, n_kept)
 }
 
 /// Lowers the SH degree.
@@ -179,47 +120,6 @@ pub(super) fn lower_degree(training: &mut Training, sh_degree: u32) -> Result<()
     *splats = splats.resized(&training.recorder.gpu, splats.capacity, sh_degree)?;
     training.recorder.passes.clear_bindings();
     Ok(())
-}
-
-/// Copies the splats with the given indices, including their moments.
-fn gather_splats(
-    recorder: &mut Recorder,
-    splats: &SplatBuffers,
-    learn: &TrainPipelines,
-    kept: &[u32],
-    capacity: u32,
-) -> Result<SplatBuffers, Error> {
-    let Recorder { gpu, passes } = recorder;
-    let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
-    let mut fewer = SplatBuffers::new(gpu, capacity, splats.sh_degree)?;
-    let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
-    // One kernel copies all buffers, because it treats each entry as a number of words. Planes of
-    // one buffer are as far apart as the capacity, which differs between the two models.
-    for ((from, n_planes, bytes), (to, _, _)) in splats.planes().iter().zip(fewer.planes()) {
-        let words = u32::try_from(bytes / 4).expect("an entry has a few words");
-        let gathering = Gathering {
-            n_kept,
-            n_planes: *n_planes,
-            words,
-            from_capacity: splats.capacity,
-            to_capacity: fewer.capacity,
-        };
-        let buffers = [
-            (
-                "gathering",
-                &gpu.uniform_with("splat.gathering", &gathering),
-            ),
-            ("kept", &indices),
-            ("from_words", *from),
-            ("to_words", to),
-        ];
-        let n_words = u64::from(n_kept) * u64::from(words) * u64::from(*n_planes);
-        passes.dispatch(gpu, &learn.gather, n_words.div_ceil(256), &buffers);
-    }
-    passes.submit(gpu);
-    fewer.set_active_degree(gpu, splats.active_degree());
-    fewer.set_n_splats(gpu, n_kept);
-    Ok(fewer)
 }
 
 #[cfg(test)]
@@ -300,13 +200,13 @@ mod tests {
         let limit = training.model.limit() as usize;
         let n_free = limit - before.n_splats();
         // Nothing is removed while there is room.
-        make_room(training, n_splats_u32(n_free)).unwrap();
+        training.make_room(n_splats_u32(n_free)).unwrap();
         assert_eq!(training.model.splats.read(&gpu).unwrap(), before);
         // One splat too many frees a sixteenth, and as many as the limit free a quarter.
         let mut n_expected = before.n_splats();
         for (n_new, n_removed) in [(n_free + 1, limit / 16), (limit, limit / 4)] {
             let before = training.model.splats.read(&gpu).unwrap();
-            make_room(training, n_splats_u32(n_new)).unwrap();
+            training.make_room(n_splats_u32(n_new)).unwrap();
             let after = training.model.splats.read(&gpu).unwrap();
             let n_removed = n_removed.min(before.n_splats() / 2);
             n_expected -= n_removed;

@@ -4,7 +4,6 @@
 use super::lazy_pipelines::LazyPipelines;
 use super::learning_rates;
 use super::model::{TrainedModel, n_splats_u32};
-use super::model_size;
 use super::optimizer::{Optimizer, StepContext};
 use super::recorder::Recorder;
 use super::renderer::Renderer;
@@ -50,8 +49,6 @@ pub(super) struct Training {
     pub(super) seeding: Seeding,
     /// Background loaded with a saved model.
     pub(super) saved_background_srgb: [f32; 3],
-    /// Whether the memory was large enough for a copy of the model, whenever one was made.
-    pub(super) has_room_for_copy: bool,
     skipped: SkippedSteps,
 }
 
@@ -72,7 +69,6 @@ impl Training {
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
             saved_background_srgb: [0.0; 3],
-            has_room_for_copy: true,
             skipped: SkippedSteps::default(),
             recorder: Recorder::new(gpu),
             options,
@@ -117,9 +113,24 @@ impl Training {
         let n_seeds = seeds.iter().map(SplatArrays::n_splats).sum();
         // Before the first step, no splat is less important than another.
         if self.schedule.step > 0 {
-            model_size::make_room(self, n_splats_u32(n_seeds))?;
+            self.make_room(n_splats_u32(n_seeds))?;
         }
         seeds.iter().try_for_each(|seeds| self.add(seeds))
+    }
+
+    /// Removes splats if `n_new` splats would exceed the limit.
+    ///
+    /// In a live run, growth may reach the limit while the images show only the first places. Later
+    /// places would then get no splats.
+    pub(super) fn make_room(&mut self, n_new: u32) -> Result<(), Error> {
+        let n_removed = self.model.n_to_remove(n_new);
+        if n_removed == 0 {
+            return Ok(());
+        }
+        self.finish_in_flight()?;
+        let learn = self.learn()?;
+        self.model
+            .remove_faintest(&mut self.recorder, &learn, n_removed)
     }
 
     /// Seeds the areas that depth does not cover. If any keyframe has depth, discs are used.
