@@ -4,7 +4,7 @@ use crate::authority::Authority;
 use crate::body::Body;
 use crate::capsule::Capsule;
 use crate::check::{check, positive};
-use crate::clearance::{ClearanceConfig, ClearancePoints, PartStep, Restriction};
+use crate::clearance::{ClearanceConfig, ClearancePoints, Restriction};
 use crate::clutch::ClutchConfig;
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
@@ -360,17 +360,24 @@ impl ArmChain {
         }
     }
 
-    /// Fraction of full speed because parts of the robot are close to each other.
+    /// Fraction of full speed because of what is near.
     fn speed_scale(&self, here: &Surroundings, limits: &mut Vec<Limit>) -> f64 {
-        let (scale, reason) = self.self_collision.speed(&here.close_pairs, &self.body);
-        if let (true, Some(reason)) = (scale < 1.0, reason) {
-            limits.push(Limit {
-                link: Link::SelfCollision,
-                effect: Effect::Slowed(scale),
-                reason,
-            });
+        let own = self.self_collision.speed(&here.close_pairs, &self.body);
+        let scene = self
+            .clearance
+            .speed(&here.restrictions, &here.points_in_base, &self.body);
+        let mut slowest = 1.0;
+        for (link, (scale, reason)) in [(Link::SelfCollision, own), (Link::Clearance, scene)] {
+            if let (true, Some(reason)) = (scale < 1.0, reason) {
+                limits.push(Limit {
+                    link,
+                    effect: Effect::Slowed(scale),
+                    reason,
+                });
+            }
+            slowest = f64::min(slowest, scale);
         }
-        scale
+        slowest
     }
 
     /// The next target, and its distance from the scene. `None` if the target stays.
@@ -406,15 +413,6 @@ impl ArmChain {
             chain: &self.chain,
             inverse: self.inverse.as_ref(),
             body: &self.body,
-            near_scene: &|step: &PartStep<'_>| {
-                let Surroundings {
-                    restrictions,
-                    points_in_base,
-                    ..
-                } = here;
-                let points = &self.clearance;
-                points.excess(restrictions, points_in_base, step, &self.body)
-            },
         };
         let step = match self.limits.step(&model, q, &goal, pace) {
             Ok(step) => step,

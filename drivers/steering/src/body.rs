@@ -230,32 +230,6 @@ impl Body {
     ///
     /// * `q`: finite joint values in the order of the chain.
     pub fn capsules(&self, q: &[f64]) -> Vec<Capsule> {
-        let base_from_frames = self.base_from_frames(q);
-        self.parts
-            .iter()
-            .map(|part| {
-                part.capsule_in_frame
-                    .transformed(&base_from_frames[part.frame_ix])
-            })
-            .collect()
-    }
-
-    /// Angles by which the frames turn between two postures, radians.
-    pub(crate) fn turned_rad(&self, from: &[f64], to: &[f64]) -> Vec<f64> {
-        let [from, to] = [from, to].map(|q| self.base_from_frames(q));
-        let pairs = from.iter().zip(&to);
-        pairs
-            .map(|(from, to)| from.rotation.angle_to(&to.rotation))
-            .collect()
-    }
-
-    /// Whether a frame moves with all joints of the chain, as the tip does.
-    pub(crate) fn is_tip(&self, frame_ix: usize) -> bool {
-        let motion = self.frames[frame_ix].motion.as_ref();
-        motion.is_some_and(|motion| motion.joint_ix + 1 == self.n_joints)
-    }
-
-    fn base_from_frames(&self, q: &[f64]) -> Vec<Transform> {
         let mut base_from_frames: Vec<Transform> = Vec::with_capacity(self.frames.len());
         for frame in &self.frames {
             let parent = frame
@@ -267,7 +241,13 @@ impl Body {
                 .map_or_else(Transform::identity, |motion| motion.at(q));
             base_from_frames.push(parent * frame.parent_from_joint * motion);
         }
-        base_from_frames
+        self.parts
+            .iter()
+            .map(|part| {
+                part.capsule_in_frame
+                    .transformed(&base_from_frames[part.frame_ix])
+            })
+            .collect()
     }
 
     fn add_shapes(

@@ -1,7 +1,7 @@
 //! Fifth link: the arm keeps a distance from the scene, which is known only where and when it was
 //! seen.
 //!
-//! This file decides how fast each part may move. The distances come from a model of the scene behind
+//! This file decides how fast the arm may move. The distances come from a model of the scene behind
 //! the trait [`Clearance`].
 
 use crate::body::Body;
@@ -11,10 +11,9 @@ use crate::error::Error;
 use crate::ramp::{check_ramp, speed_scale};
 use crate::reason::Reason;
 use kinematics::Stamp;
-use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-/// Rounding of products and ratios. A multiple of a step, for example, stays the same.
+/// Rounding of a product, so that a multiple of a step stays the same.
 const ROUNDING: f64 = 1e-6;
 
 /// What is known about the surroundings of a point.
@@ -59,13 +58,13 @@ pub trait Clearance {
 pub struct ClearanceConfig {
     /// Distance from a surface below which no part approaches it any more.
     pub stop_m: f64,
-    /// Distance below which a part is slower.
+    /// Distance below which the arm is slower.
     pub slow_m: f64,
     /// Smallest fraction of full speed.
     pub creep_frac: f64,
-    /// Age up to which a part moves at full speed.
+    /// Age up to which the arm moves at full speed.
     pub fresh_secs: f64,
-    /// Age from which a part moves at `stale_frac` of full speed.
+    /// Age from which the arm moves at `stale_frac` of full speed.
     pub stale_secs: f64,
     /// Fraction of full speed in a region that was not seen for `stale_secs` or longer.
     pub stale_frac: f64,
@@ -191,19 +190,6 @@ pub struct ClearancePoints {
     points: Vec<PartPoint>,
 }
 
-/// How the parts of a robot move in a step.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct PartStep<'a> {
-    /// Parts at the end of the step.
-    pub(crate) after: &'a [Capsule],
-    /// Angle by which each frame of the body turns, radians.
-    pub(crate) turned_rad: &'a [f64],
-    /// Maximum distance of a part, meters.
-    pub(crate) max_m: f64,
-    /// Maximum angle of the tip, radians.
-    pub(crate) max_rad: f64,
-}
-
 /// A sphere in a part. The spheres of a part together cover it.
 #[derive(Clone, Debug)]
 struct PartPoint {
@@ -274,44 +260,23 @@ impl ClearancePoints {
         restrictions
     }
 
-    /// The largest ratio of the speed of a restricted point to its maximum speed, with the reason
-    /// of the restriction; `None` if all points are slow enough.
-    ///
-    /// Each restriction limits only the part that is near a surface. The shoulder of an arm on a
-    /// table is always near the table, but hardly moves. If a part turns, its surface also moves.
-    /// What the tip holds may be longer than the parts, so the angular speed of the tip is limited
-    /// as well.
-    ///
-    /// * `here`: the restrictions at the begin of the step, at `points_in_base`.
-    pub(crate) fn excess(
+    /// Speed as a fraction of full speed, with its reason if it is less.
+    pub(crate) fn speed(
         &self,
         here: &[Restriction],
         points_in_base: &[[f64; 3]],
-        step: &PartStep<'_>,
         body: &Body,
-    ) -> Option<(f64, Reason)> {
-        let points_after = self.in_base(step.after);
-        let ratios = here.iter().map(|restriction| {
-            let ix = restriction.point_ix;
-            let point = &self.points[ix];
-            let [from, to] = [points_in_base[ix], points_after[ix]].map(Vector3::from);
-            let frame_ix = body.part(point.part_ix).frame_ix;
-            let turned_rad = step.turned_rad[frame_ix];
-            let moved_m = (to - from).norm() + point.radius_m * turned_rad;
-            let ratio = moved_m / step.max_m;
-            let ratio = if body.is_tip(frame_ix) {
-                ratio.max(turned_rad / step.max_rad)
-            } else {
-                ratio
-            };
-            let scale = restriction
+    ) -> (f64, Option<Reason>) {
+        let scale = |restriction: &Restriction| {
+            restriction
                 .seen
-                .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen));
-            (ratio / scale, restriction)
-        });
-        let (ratio, worst) = ratios.max_by(|a, b| a.0.total_cmp(&b.0))?;
-        // A step that was shortened to its limit is not shortened again because of rounding.
-        (ratio > 1.0 + ROUNDING).then(|| (ratio, self.reason(worst, points_in_base, body)))
+                .map_or(self.config.creep_frac, |seen| self.config.scale_of(seen))
+        };
+        let slowest = here.iter().min_by(|a, b| scale(a).total_cmp(&scale(b)));
+        slowest.map_or((1.0, None), |slowest| {
+            let reason = self.reason(slowest, points_in_base, body);
+            (scale(slowest), Some(reason))
+        })
     }
 
     /// Why the arm may not move to a close posture, if it may not. A motion away from a surface,

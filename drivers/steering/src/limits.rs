@@ -1,5 +1,4 @@
-//! Third link: how far the target moves in one cycle. Parts near the scene move less far, see
-//! [`ClearancePoints::excess`](crate::clearance::ClearancePoints::excess).
+//! Third link: how far the target moves in one cycle.
 //!
 //! The target moves in small steps from the last one toward the goal. Each step is limited in the
 //! speed of the tip, of every joint and of every part of the robot, so an elbow cannot swing fast
@@ -9,7 +8,6 @@
 
 use crate::body::Body;
 use crate::check::{check, positive};
-use crate::clearance::PartStep;
 use crate::error::Error;
 use crate::inverse::InverseKinematics;
 use crate::reason::{Effect, Limit, Link, Reason};
@@ -91,9 +89,6 @@ pub(crate) struct Model<'a> {
     pub(crate) chain: &'a Chain,
     pub(crate) inverse: &'a dyn InverseKinematics,
     pub(crate) body: &'a Body,
-    /// Ratio of the speed of a part near the scene to its maximum, if it is too fast; see
-    /// [`ClearancePoints::excess`](crate::clearance::ClearancePoints::excess).
-    pub(crate) near_scene: &'a dyn Fn(&PartStep<'_>) -> Option<(f64, Reason)>,
 }
 
 /// Duration of a cycle, and the fraction of full speed.
@@ -321,44 +316,21 @@ impl Limits {
             return q.to_vec();
         }
         let mut next = toward;
-        // The scene comes last, so that its limit is relative to a motion that is possible elsewhere.
-        for link in [Link::Limits, Link::Clearance] {
-            for _ in 0..MAX_ROUNDS {
-                let excess = match link {
-                    Link::Clearance => self.excess_near_scene(model, q, &next, cycle),
-                    _ => self.excess(model, q, &next, cycle),
-                };
-                let Some((ratio, reason)) = excess else {
-                    break;
-                };
-                let scale = 1.0 / ratio;
-                limits.push(Limit {
-                    link,
-                    effect: Effect::Slowed(scale),
-                    reason,
-                });
-                for (next, q) in next.iter_mut().zip(q) {
-                    *next = q + (*next - q) * scale;
-                }
+        for _ in 0..MAX_ROUNDS {
+            let Some((ratio, reason)) = self.excess(model, q, &next, cycle) else {
+                return next;
+            };
+            let scale = 1.0 / ratio;
+            limits.push(Limit {
+                link: Link::Limits,
+                effect: Effect::Slowed(scale),
+                reason,
+            });
+            for (next, q) in next.iter_mut().zip(q) {
+                *next = q + (*next - q) * scale;
             }
         }
         next
-    }
-
-    /// By what factor a step is too long for what is near the scene, and why.
-    fn excess_near_scene(
-        &self,
-        model: &Model<'_>,
-        q: &[f64],
-        next: &[f64],
-        cycle: f64,
-    ) -> Option<(f64, Reason)> {
-        (model.near_scene)(&PartStep {
-            after: &model.body.capsules(next),
-            turned_rad: &model.body.turned_rad(q, next),
-            max_m: self.config.max_speed_m_s * cycle,
-            max_rad: self.config.max_angular_rad_s * cycle,
-        })
     }
 
     /// By what factor a step is too long, and why.

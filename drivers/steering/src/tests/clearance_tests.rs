@@ -66,7 +66,16 @@ fn arm_slows_before_a_surface_and_is_refused_at_it_with_the_place() {
         from_center_m > BALL_M && from_center_m < BALL_M + 0.2,
         "{place:?}"
     );
-    let nearest_m = nearest_m(&sim, &last.target().unwrap().position, center);
+    let body = crate::Body::new(&super::panda().0, &sim.chain, &|_| None).unwrap();
+    let capsules = body.capsules(&last.target().unwrap().position);
+    let ball = Capsule {
+        ends: [center, center],
+        radius_m: BALL_M,
+    };
+    let nearest_m = (0..body.n_parts())
+        .filter(|ix| body.part(*ix).frame_ix > 0)
+        .map(|ix| capsules[ix].gap(&ball).distance_m)
+        .fold(f64::INFINITY, f64::min);
     assert!(nearest_m >= STOP_M, "{nearest_m}");
     // The arm has come close: the spheres of the samples are up to 12 % larger than the parts.
     assert!(nearest_m < STOP_M + 0.02, "{nearest_m}");
@@ -76,65 +85,6 @@ fn arm_slows_before_a_surface_and_is_refused_at_it_with_the_place() {
         sim.drive(Some(1), pose_intent(&above));
     }
     assert!((sim.tip().translation.z - above.translation.z).abs() < 1e-3);
-}
-
-/// An arm on a table has the table near its shoulder all the time.
-#[test]
-fn a_surface_near_the_shoulder_does_not_slow_the_hand() {
-    let behind = Solid::Sphere {
-        center: [-0.3, 0.0, 0.2],
-        radius_m: BALL_M,
-    };
-    let tips = [Vec::new(), vec![behind]].map(|solids| {
-        let mut sim = Sim::ready(ageless());
-        sim.scene = Box::new(scene(solids));
-        let above = Transform::translation(0.05, 0.1, 0.1) * sim.tip();
-        for _ in 0..60 {
-            let verdict = sim.drive(Some(1), pose_intent(&above));
-            assert!(!has(&verdict, |_, _| true), "{}", words(&verdict));
-        }
-        sim.tip()
-    });
-    assert_eq!(tips[0], tips[1]);
-    // The ball is close enough to slow the shoulder down.
-    let sim = Sim::ready(ageless());
-    let near_m = nearest_m(&sim, &super::START, Vector3::new(-0.3, 0.0, 0.2));
-    assert!(near_m < ClearanceConfig::default().slow_m, "{near_m}");
-}
-
-/// The operator may hold something that is longer than the hand.
-#[test]
-fn the_hand_turns_slowly_near_a_surface() {
-    let turned_rad = |gap_m: f64| {
-        let mut sim = Sim::ready(ageless());
-        let start = sim.tip();
-        let (ball, _) = ball_below(&sim, gap_m);
-        sim.scene = Box::new(scene(vec![ball]));
-        let turned = start * Transform::rotation(Vector3::z() * 1.5);
-        for _ in 0..40 {
-            sim.drive(Some(1), pose_intent(&turned));
-        }
-        sim.tip().rotation.angle_to(&start.rotation)
-    };
-    let [far_rad, near_rad] = [1.0, 0.08].map(turned_rad);
-    assert!(
-        near_rad > 0.05 * far_rad && near_rad < 0.5 * far_rad,
-        "{near_rad} {far_rad}"
-    );
-}
-
-/// Distance of a ball from the parts that move with the joints.
-fn nearest_m(sim: &Sim, q: &[f64], center: Vector3<f64>) -> f64 {
-    let body = crate::Body::new(&super::panda().0, &sim.chain, &|_| None).unwrap();
-    let capsules = body.capsules(q);
-    let ball = Capsule {
-        ends: [center, center],
-        radius_m: BALL_M,
-    };
-    (0..body.n_parts())
-        .filter(|ix| body.part(*ix).frame_ix > 0)
-        .map(|ix| capsules[ix].gap(&ball).distance_m)
-        .fold(f64::INFINITY, f64::min)
 }
 
 #[test]
