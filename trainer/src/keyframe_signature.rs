@@ -152,15 +152,14 @@ pub(crate) fn match_keyframes(
         let same = candidates
             .iter()
             .find(|keyframe| expected.difference(keyframe).is_none());
-        if let Some(same) = same {
-            found.push((Arc::clone(same), *same));
+        let keyframe = same.unwrap_or(last);
+        let Some(difference) = expected.difference(keyframe) else {
+            found.push((Arc::clone(keyframe), *keyframe));
             continue;
-        }
-        match (expected.with_recorded_base(last), expected.difference(last)) {
-            (Some(recorded), _) => found.push((Arc::new(recorded), *last)),
-            (None, difference) => {
-                return Err(Error::CheckpointData(difference.unwrap_or_default()));
-            }
+        };
+        match expected.with_recorded_base(keyframe) {
+            Some(recorded) => found.push((Arc::new(recorded), *keyframe)),
+            None => return Err(Error::CheckpointData(difference)),
         }
     }
     // All missing keyframes are listed, so that the caller can continue without them in one
